@@ -1,5 +1,7 @@
 """Define the base classes of all controllers, and check their arguments."""
 
+from __future__ import annotations
+
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -83,6 +85,7 @@ class Controller(ABC):
     command: Values = field(init=False, repr=False)
 
     _edge = 0.0  # of the dead zone, t/h; a command on it keeps its effect as an action
+    _remembers = True  # past samples; if not, the batch size may change at any time
 
     def __post_init__(self) -> None:
         for name, of in _types_of(type(self)).items():
@@ -164,7 +167,7 @@ class Controller(ABC):
             )
         command = self._control(np.atleast_2d(values))
         self.command = command if len(now) else command[0]
-        self._loops_before = now
+        self._loops_before = now if self._remembers else None
         return float32_action(self.command, self.u_min, self.u_max, self._edge)[..., np.newaxis]
 
     @abstractmethod

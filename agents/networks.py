@@ -172,6 +172,7 @@ class PolicyNetwork(Controller):
         self._edge = self.increments.dead_zone if self.increments else 0.0
         self.input_scale = check_array("input_scale", self.input_scale, (self.n_obs,))
         self.layers = check_layers(self.layers, self.n_obs, 1)
+        self._remembers = self.increments is not None
 
     @classmethod
     def load(

@@ -1,5 +1,7 @@
 """Combine a trained network with a bank of models that identifies the plant."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 
 import numpy as np

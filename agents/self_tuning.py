@@ -1,5 +1,7 @@
 """Implement a self-tuning controller, which identifies the plant while controlling it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar

@@ -4,6 +4,8 @@
 PyTorch tensors.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any

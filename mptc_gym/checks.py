@@ -124,9 +124,12 @@ def numbers(
     name: str, value: Any, allowed: str = _COEFFICIENTS, most: float = MOST_COEFFICIENTS
 ) -> tuple[float, ...]:
     """Return the numbers of a list that has 1 to `most`."""
-    fits = isinstance(value, list | tuple) and 0 < len(value) <= most
-    if not fits or not all(map(is_number, value)):
+    if not isinstance(value, list | tuple) or not 0 < len(value) <= most:
         reject(name, value, allowed)
+    for i, element in enumerate(value):
+        if not is_number(element):
+            where = f"{shorten(value)}, where element {i} is {shorten(element)}"
+            raise ValueError(f"{name} must be {allowed}, got {where}")
     return tuple(map(float, value))
 
 

@@ -152,8 +152,10 @@ def frame(record: Record) -> NDArray[np.uint8]:
 def show(record: Record, fps: float) -> None:
     """Show a picture in the window, opened if necessary, at most `fps` times a second."""
     pygame.display.init()
-    screen = pygame.display.get_surface() or pygame.display.set_mode(SIZE)
-    pygame.display.set_caption("MiddlePoint-v0")
+    screen = pygame.display.get_surface()
+    if screen is None or screen.get_size() != SIZE:
+        screen = pygame.display.set_mode(SIZE)
+        pygame.display.set_caption("MiddlePoint-v0")
     screen.blit(draw(record), (0, 0))
     pygame.event.pump()
     clock.tick(fps)

@@ -1,5 +1,7 @@
 """Simulate one plant, its set point and its transmitter: the environment `MiddlePoint-v0`."""
 
+from __future__ import annotations
+
 import inspect
 import math
 from copy import copy
@@ -246,7 +248,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         if self._root is not self.np_random:
             self._root = self.np_random
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
-            self._streams = [Streams.of_seed(seeds.entropy, seeds.spawn_key)]
+            self._streams = [Streams.spawn(seeds)]
         parameters = self.parameters
         drawn = self._ranges.draw(self._streams)
         setpoint = self._signals.reset(ONE, self._streams, drawn).item()

@@ -1,5 +1,7 @@
 """Score any policy on fixed episodes, in the environments that it is to act in."""
 
+from __future__ import annotations
+
 import itertools
 import json
 from dataclasses import asdict, dataclass, replace

@@ -53,7 +53,9 @@ class PlantNumbers(Generic[Value]):
     measurement_noise_variance: Value = _arg(
         0.0, checks.not_negative, "degC^2", "variance of the transmitter's white noise"
     )
-    disturbance_amplitude: Value = _arg(0.0, checks.not_negative, "degC", "largest load level")
+    disturbance_amplitude: Value = _arg(
+        0.0, checks.not_negative, "degC", "largest level of the load's steps"
+    )
     disturbance_interval: Value = _arg(
         150.0, checks.at_least_1, "samples", "mean interval of its steps; below 10 it is 10"
     )
@@ -62,7 +64,9 @@ class PlantNumbers(Generic[Value]):
     )
     gain_factor: Value = _arg(1.0, checks.positive, "1", "multiple of the steady-state gain")
     time_constant_factor: Value = _arg(1.0, checks.positive, "1", "that of the time constant")
-    gain_drift: Value = _arg(1.0, checks.positive, "1", "factor of the gain in `drift_samples`")
+    gain_drift: Value = _arg(
+        1.0, checks.positive, "1", "factor by which the gain changes in `drift_samples`"
+    )
     time_constant_drift: Value = _arg(1.0, checks.positive, "1", "that of the time constant")
 
     def chosen(self, names: Iterable[str]) -> dict[str, Value]:

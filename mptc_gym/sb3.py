@@ -7,6 +7,8 @@
 Requires `pip install "mptc_gym[sb3]"`.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import pkgutil

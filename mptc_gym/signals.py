@@ -48,15 +48,15 @@ class EpisodeStream:
 
     generator: np.random.Generator  # of the current episode
 
-    def __init__(self, entropy: Any, spawn_key: tuple[int, ...]) -> None:
-        self._seeds = entropy, spawn_key
+    def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
+        self._seeds = entropy, spawn_key, pool_size
         self._episode = 0
 
     def next_episode(self) -> np.random.Generator:
         """Move to the start of the next episode and return the generator there."""
         if self._episode == 0:
-            entropy, spawn_key = self._seeds
-            seeds = np.random.SeedSequence(entropy, spawn_key=spawn_key)
+            entropy, spawn_key, pool_size = self._seeds
+            seeds = np.random.SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size)
             self.generator = np.random.Generator(np.random.PCG64(seeds))
             self._origin = self.generator.bit_generator.state["state"]
         else:
@@ -77,9 +77,15 @@ class Streams(NamedTuple):
     measurement_noise: EpisodeStream
 
     @classmethod
-    def of_seed(cls, seed: Any, key: tuple[int, ...] = ()) -> Streams:
-        """Make the streams of a `SeedSequence`: those that it spawns, but faster."""
-        return cls(*(EpisodeStream(seed, (*key, place)) for place in range(len(cls._fields))))
+    def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
+        """Make the streams of a seed sequence, each from a child that nobody else gets."""
+        children = seeds.spawn(len(cls._fields))
+        return cls(*(EpisodeStream(c.entropy, c.spawn_key, c.pool_size) for c in children))
+
+    @classmethod
+    def of_seed(cls, seed: int) -> Streams:
+        """Make the streams that `spawn` makes from `SeedSequence(seed)`, but faster."""
+        return cls(*(EpisodeStream(seed, (place,)) for place in range(len(cls._fields))))
 
 
 class Ranges:

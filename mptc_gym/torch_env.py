@@ -1,5 +1,7 @@
 """Simulate many plants side by side in PyTorch, on any device, optionally with gradients."""
 
+from __future__ import annotations
+
 import inspect
 import math
 from collections.abc import Iterator, Mapping, Sequence

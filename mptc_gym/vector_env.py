@@ -1,5 +1,7 @@
 """Simulate many plants side by side in NumPy, as a Gymnasium vector environment."""
 
+from __future__ import annotations
+
 import inspect
 import math
 from collections.abc import Mapping, Sequence

@@ -368,7 +368,13 @@ class TestPolicyNetwork:
             if abs(flow) > 1e-5:
                 assert network.command == pytest.approx(command, abs=2e-5)
 
-    def test_an_observation_of_other_windows_is_refused(self):
+    def test_without_increments_batches_may_change_but_never_windows(self):
+        network, moving = gain_of(0.0, 0.5), gain_of(0.0, 0.5, increments=Increments(0.8))
+        for each in (network, moving):
+            each.act([[0.0], [0.0]])
+        network.act([[0.0]])
+        with pytest.raises(ValueError, match="since reset"):
+            moving.act([[0.0]])
         for size in (4, 6):
             with pytest.raises(ValueError, match=r"^observation must .*5[ ,]"):
                 policy().act(np.zeros(size))

@@ -257,6 +257,15 @@ EVERYTHING = {
 }  # fmt: skip
 
 
+def test_plants_that_share_a_generator_differ_in_what_they_draw():
+    generator, levels = np.random.default_rng(5), set()
+    for _ in range(2):
+        env = MiddlePointEnv(setpoint="random")
+        env.np_random = generator
+        levels.add(env.reset()[1]["setpoint"])
+    assert len(levels) == 2
+
+
 def test_what_a_seed_draws_never_changes():
     # The third of the seed's streams is the plant's. Which draw a plant number takes is part
     # of what a seed means.

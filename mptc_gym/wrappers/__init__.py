@@ -3,6 +3,8 @@
 `mptc_gym.wrappers.vector` does so for vector environments.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Wrap many environments at once so that actions change the flow instead of setting it."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 
