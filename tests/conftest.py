@@ -4,9 +4,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 # Before NumPy and PyTorch are loaded: the processes of the tests share the cores already.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -15,9 +13,8 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"  # windows that nobody sees
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from hypothesis import strategies as st
-from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.loop.rollout import Trajectory
 from mptc_gym import MiddlePointVectorEnv, checks
@@ -29,7 +26,7 @@ ROOT = Path(__file__).parent.parent
 few = st.floats(-0.3, 0.3)
 tails = st.lists(few, max_size=3).map(lambda tail: [1.0, *tail])
 levels = st.floats(-100, 100)
-BY_CHECK: dict[Any, st.SearchStrategy[Any]] = {
+BY_CHECK = {
     checks.number: few,
     checks.samples: st.integers(0, 30),
     checks.duration: st.integers(1, 100),
@@ -43,22 +40,18 @@ BY_CHECK: dict[Any, st.SearchStrategy[Any]] = {
     | levels
     | st.lists(levels, min_size=1, max_size=5),
 }
-BY_NAME: dict[
-    str, st.SearchStrategy[Any]
-] = {  # what fits together, and readings that are not always at the end of the span
+BY_NAME = {  # what fits together, and readings that are not always at the end of the span
     "dead_zone": st.floats(0, 10),
     "u_min": st.floats(-20, -10),
     "u_max": st.floats(0, 20),
     "temperature_span": st.floats(0.5, 200),
 }
-
-
 STRATEGIES = {name: BY_NAME.get(name, BY_CHECK[each.check]) for name, each in ARGUMENTS.items()}
 for name in PLANT_NUMBERS:
     STRATEGIES[name] |= st.lists(STRATEGIES[name], min_size=2, max_size=2).map(sorted)
 
 
-def _without(refused: str) -> st.SearchStrategy[dict[str, Any]]:
+def _without(refused):
     chosen = {name: each for name, each in STRATEGIES.items() if not re.match(refused, name)}
     return st.fixed_dictionaries({}, optional=chosen)
 
@@ -72,9 +65,7 @@ MODES = [mode.value for mode in AutoresetMode]
 NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
 
 
-def run(
-    env: gymnasium.Env[Any, Any], actions: Iterable[Any], seed: int | None = 0
-) -> dict[str, NDArray[np.float64]]:
+def run(env, actions, seed=0):
     """Reset, take all actions, and return observations, rewards and infos, k = 0 first.
 
     An action may be a function of the observation.
@@ -93,13 +84,7 @@ def run(
     return {"observation": np.array(observations), "reward": np.array(rewards)} | record
 
 
-def native_and_sync(
-    num_envs: int,
-    mode: str,
-    limit: int | None = None,
-    wrappers: Sequence[Any] = (),
-    **arguments: Any,
-) -> tuple[VectorEnv, VectorEnv]:
+def native_and_sync(num_envs, mode, limit=None, wrappers=(), **arguments):
     """Return the vector environment, and Gymnasium's of one (wrapped) after the other."""
     native = gymnasium.make_vec(
         "MiddlePoint-v0", num_envs, max_episode_steps=limit, autoreset_mode=mode, **arguments
@@ -113,14 +98,14 @@ def native_and_sync(
     return native, sync
 
 
-def python(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
+def python(*words, **options):
     """Run Python with these words, in the checkout."""
     command = [sys.executable, *words]
     options = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 300.0, **options}
     return subprocess.run(command, **options)
 
 
-def random_actions(rng: np.random.Generator, n: int) -> NDArray[np.float32]:
+def random_actions(rng, n):
     """Return actions of n plants, some of them huge or on the edge of the dead zone."""
     actions = rng.normal(0, 1, (n, 1)).astype(np.float32)
     actions[rng.random(n) < 0.1] *= 1e6
@@ -128,19 +113,14 @@ def random_actions(rng: np.random.Generator, n: int) -> NDArray[np.float32]:
     return actions
 
 
-def assert_the_seed_is_all_that_differs(made: Callable[[int], ArrayLike]) -> None:
+def assert_the_seed_is_all_that_differs(made):
     """Make it twice with a seed and once with another, and compare."""
     first, again, other = (np.asarray(made(seed)) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
 
 
-def trajectory(
-    setpoint: ArrayLike,
-    output: ArrayLike,
-    command: ArrayLike | None = None,
-    applied: ArrayLike | None = None,
-) -> Trajectory:
+def trajectory(setpoint, output, command=None, applied=None):
     """Return one run, of columns, as if each step led to its own sample."""
     command = np.zeros(len(setpoint)) if command is None else command
     applied = command if applied is None else applied
@@ -149,15 +129,15 @@ def trajectory(
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     return np.random.default_rng(20261121)
 
 
 @pytest.fixture
-def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def refused(capsys):
     """Return a function that runs a command, and returns with which words it refuses."""
 
-    def refused(main: Callable[[Sequence[str]], int], given: Sequence[object]) -> str:
+    def refused(main, given):
         capsys.readouterr()  # what came before
         with pytest.raises(SystemExit) as stop:
             main([str(each) for each in given])

@@ -45,10 +45,6 @@ def test_ranges_stand_for_their_middle_and_what_is_added_does_not_show():
     np.testing.assert_array_equal(nominal(drawn).beta, nominal(middle).beta)
 
 
-def test_an_integrating_plant_has_a_gain_of_one_sign():
-    assert nominal(Parameters(a=[1.0, -1.0], b=[-0.1])).gain == -np.inf
-
-
 def test_paper_plant_shows_the_numbers_its_controllers_are_tuned_with():
     found = step_test(Parameters())
     # Steady-state gain -0.0496 / 0.0727, the time constant of the pole at 0.9515, 19 samples.
@@ -73,6 +69,8 @@ def test_plant_without_a_new_steady_state_is_refused():
     for name, values in (("a", [1.0, -1.0]), ("a", [1.0, -1.1]), ("b", [0.1, -0.1])):
         with pytest.raises(ValueError, match=f"^{name} must"):
             step_test(Parameters(**{name: values}))
+    # The gain of one that integrates has a sign.
+    assert nominal(Parameters(a=[1.0, -1.0], b=[-0.1])).gain == -np.inf
 
 
 def test_bad_plant_file_is_named(tmp_path):

@@ -21,9 +21,9 @@ SOURCES = {
 }
 
 
-def packages(code: str) -> set[str]:
+def packages(code):
     """Return which packages are imported, also within functions."""
-    found: set[str] = set()
+    found = set()
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
