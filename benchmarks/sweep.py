@@ -9,14 +9,14 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER, Controller, label
-from benchmarks.lib.command import Folder, Runs, Seed, blame, command, options
+from benchmarks.lib.command import Folder, Parameter, Runs, Seed, blame, command, options
 from benchmarks.lib.storage import Kept, UsageError, origin, out_folder, write_csv, write_json
 from benchmarks.loop.rollout import Trajectory, held, measure
 from benchmarks.loop.scenarios import Arguments, PlantOptions, around, random_design
@@ -43,11 +43,18 @@ TEXT = (
     "than without control. This, and no better than no control, are shares of the runs."
 )
 PICTURE = "Error on each plant, as a multiple of the least possible"
-GROUPS = {"no drift": "gain_drift.isna()", "all that drift": "gain_drift > 0"}  # of plants
+GROUPS = {  # of the plants of a random design, a row each
+    "no drift": "gain_drift.isna()",
+    "all that drift": "gain_drift > 0",
+    "delay below 14 samples": "gain_drift > 0 and delay < 14",
+    "delay from 14 to 22 samples": "gain_drift > 0 and 14 <= delay <= 22",
+    "delay above 22 samples": "gain_drift > 0 and delay > 22",
+}
 QUESTIONS = {  # about pairs of controllers: does the first make the smaller error?
     "Does online learning help when the plant drifts?": (
         ("nn", "pi-simc"),
         ("nn", "nn-frozen"),
+        ("nn-frozen", "pi-simc"),
     ),
     "What does adaptation buy?": (
         ("nn-self-tuning", "nn-smith"),
@@ -82,7 +89,7 @@ class Options:
     agents: AgentNames = tuple(name for name, each in ROSTER.items() if each.swept)
     controllers: ControllerOptions = field(default_factory=ControllerOptions)
     plant: PlantOptions = field(default_factory=PlantOptions)
-    out: Folder | None = None  # results/sweep-DESIGN
+    out: Annotated[Folder | None, Parameter(help="Default: results/sweep-DESIGN.")] = None
 
 
 def work(options: Options) -> str:

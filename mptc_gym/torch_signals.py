@@ -6,8 +6,6 @@ shape (n,). `next(samples)` returns a block of the samples that follow, degC, sh
 (samples, n). All share the clock of `Episodes`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -63,7 +61,7 @@ class Episodes:
         self._rows = torch.arange(LONGEST, device=zeros.device)[:, None]
 
     def reset(
-        self, mask: Tensor, starts: NDArray[np.int64], given: Mapping[str, Given]
+        self, mask: Tensor, starts: NDArray[np.int64], given: Mapping[str, "Given"]
     ) -> dict[str, Tensor]:
         """Begin an episode of some plants, and return the numbers that are drawn or given.
 

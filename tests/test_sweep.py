@@ -133,8 +133,9 @@ def test_differences_of_runs_made_up_so_that_the_answer_is_known():
     table = sweep.differences(runs, [("nn", "pi-simc")])
     found = table.set_index("plants")["NN (1992) - PI (SIMC)"].to_dict()
     assert found.pop("all that drift").startswith("+0.500 (")
-    assert found == {"no drift": "-0.500"}
-    assert table["number"].tolist() == ["10", "20"]
+    below, above = "delay below 14 samples", "delay above 22 samples"
+    assert found == {"no drift": "-0.500", below: "+1.500", above: "-0.500"}
+    assert table["number"].tolist() == ["10", "20", "10", "10"]
     # Plants where one of them has failed do not count, and one plant is no group.
     failed = (runs["agent"] == "nn") & (runs["plant"] > 1)
     found = sweep.differences(runs[~failed], [("nn", "pi-simc")])

@@ -19,6 +19,8 @@ _CASES = (
     f"{', '.join(name for name, *_ in SETPOINTS)}."
 )
 
+_OUT = "Folder (default: results/compare, -presets with these, -other with other options)."
+
 
 @options
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +35,7 @@ class Options:
     """Run the environment's presets instead of the paper's cases."""
     runs: Runs = 100
     """Runs of each controller in each case."""
-    out: Folder | None = None  # results/compare, -presets with these, -other with more options
+    out: Annotated[Folder | None, Parameter(help=_OUT)] = None
 
 
 def work(options: Options) -> str:

@@ -4,8 +4,6 @@ A controller is added here and nowhere else: `compare`, `sweep`, `tune` and `wat
 it. A user's own (`--agent NAME=MODULE:FACTORY`) becomes such a record, too.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
@@ -87,7 +85,7 @@ class Controller:
     # Origin of a trained network, JSON-serialisable; empty if nothing was trained.
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def members(self) -> list[Controller]:
+    def members(self) -> "list[Controller]":
         """Return the controller, or one for each of the networks that it was trained to."""
         if self.networks is None:
             return [self]

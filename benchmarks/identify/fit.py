@@ -1,7 +1,5 @@
 """Fit a plant with a delay and one to three lags to a log, by weighted output error."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -107,11 +105,11 @@ class Fit:
     # The delay, the logarithm of the first lag, and one more.
     p: Array = field(default_factory=lambda: np.zeros(2))
 
-    def at(self, p: Array) -> Fit:
+    def at(self, p: Array) -> "Fit":
         """Return the fit of other parameters."""
         return replace(self, p=p)
 
-    def behind(self, passed: Array) -> Fit:
+    def behind(self, passed: Array) -> "Fit":
         """Return the fit with another flow behind the valve."""
         return replace(self, flow=passed - passed[0])
 
@@ -120,7 +118,7 @@ class Fit:
         count = len(x) // self.rows
         return np.asarray(x[: count * self.rows].reshape(count, self.rows).mean(axis=1))
 
-    def in_blocks(self, rows: int) -> Fit:
+    def in_blocks(self, rows: int) -> "Fit":
         """Return the fit to a log of single rows in blocks."""
         blocks = replace(self, rows=rows)
         return replace(blocks, temperature=blocks.means(self.temperature))
@@ -204,7 +202,7 @@ class Fit:
         lags = np.concatenate([each.lags for each in self.units])
         return Plant(self.units[0].delay, lags, np.concatenate(gains))
 
-    def refined(self, evaluations: int = 40) -> Fit:
+    def refined(self, evaluations: int = 40) -> "Fit":
         """Return the fit of the least deviance near the parameters."""
         # Steps are relative to the place: about 1, so that all are as long.
         found = least_squares(
@@ -213,7 +211,7 @@ class Fit:
         )  # fmt: skip
         return self.at(self.p + found.x - 1.0)
 
-    def reweighted(self) -> Fit:
+    def reweighted(self) -> "Fit":
         """Return the fit with weights from the noise that this one leaves."""
         table, inputs = self.columns
         left = self.temperature - table[:, :inputs] @ self.solution.c[:inputs]

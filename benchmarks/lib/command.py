@@ -147,6 +147,10 @@ def command(
         if work.__module__ == "__main__" and (spec := sys.modules["__main__"].__spec__):
             # Other processes find tasks by the name of a module to be imported.
             return int(importlib.import_module(spec.name).main())
+        os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever the shell has set
+        for stream in (sys.stdout, sys.stderr):
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="replace")  # for "°C" on an ASCII terminal
         for number in SIGNALS:
             if arguments is None and signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, _interrupt)

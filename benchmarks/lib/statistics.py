@@ -1,7 +1,5 @@
 """Estimate quantities from several runs, with 95 % confidence intervals, and percentiles."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +21,7 @@ class Estimate:
     high: float
     runs: int
 
-    def scaled(self, factor: float) -> Estimate:
+    def scaled(self, factor: float) -> "Estimate":
         """Return the estimate of a positive multiple."""
         return Estimate(factor * self.value, factor * self.low, factor * self.high, self.runs)
 

@@ -1,7 +1,5 @@
 """Roll out a controller on a batch of plants, and measure its runs."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable
@@ -61,7 +59,7 @@ class Trajectory:
     next_error: Array  # e(k + 1), degC, which the reward of sample k is for
     next_setpoint: Array  # y_d(k + 1), degC
 
-    def __getitem__(self, samples: slice) -> Trajectory:
+    def __getitem__(self, samples: slice) -> "Trajectory":
         """Return the signals of some samples."""
         return Trajectory(*(signal[samples] for signal in vars(self).values()))
 
