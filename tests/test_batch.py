@@ -78,17 +78,13 @@ def test_spaces_modes_and_arguments_are_those_of_gymnasium_s_environments(librar
     assert names == shell | library.own | set(inspect.signature(Parameters).parameters)
 
 
-SEEDS = [
-    -1, 1.5, True, "12", b"12", np.array(3.0), np.array(3), [1], [1, 2, 3], [1, -2], [1, 1.5],
-    [1, "2"],
-]  # fmt: skip
+SEEDS = [-1, 1.5, True, "12", np.array(3), [1], [1, 2, 3], [1, -2], [1, "2"]]
 MASKS = [[True, False], np.array([[True, False]]), np.array([1, 0]), np.array([True]),
          np.array([False, False]), None]  # fmt: skip
 ACTIONS = [
     np.zeros(2), np.zeros((1, 1)), np.zeros((2, 2)), np.array([[np.nan], [0.0]]),
-    np.array([[0.0], [np.inf]]), [[10**400], [0]], [["up"], ["down"]], [[0.0], [None]], None,
+    np.array([[0.0], [np.inf]]), [[10**400], [0]], [[0.0], [None]], None, [[0.3], [0.3j]],
     [["0.3"], ["0.3"]], np.array([["0.3"], ["0.3"]]), [[b"0.3"], [b"0.3"]], [["0.3"], [0.3]],
-    [[0.3], [0.3j]],
 ]  # fmt: skip
 REFUSED = [
     *(("make", {name: value}, f"^{name} must be") for name, value in [

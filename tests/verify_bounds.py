@@ -35,10 +35,7 @@ CASES = {
 
 
 class Counting:
-    """A controller that counts samples, and so knows when the square wave changes.
-
-    On that wave it applies the flow that holds the set point d + 10 samples ahead.
-    """
+    """Apply the flow that holds the set point, of the square wave d + 10 samples ahead."""
 
     def __init__(self, parameters, **_):
         self.plant, self.gain = parameters, nominal(parameters).gain
