@@ -32,12 +32,11 @@ from agents.networks import PRETRAINED
 from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import MiddlePointEnv, Parameters
 from mptc_gym.wrappers import IncrementalAction
-from tests.conftest import assert_the_seed_is_all_that_differs
+from tests.conftest import STEP_TEST, assert_the_seed_is_all_that_differs
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
-# Of first order, nearly. Each controller is told what it has to be told.
-PLANT = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
-TOLD = {**PLANT, "closed_loop_time_constant": 80.0}
+# Each controller is told what it has to be told.
+TOLD = {**STEP_TEST, "closed_loop_time_constant": 80.0}
 NEEDS = {
     name: {p.name for p in inspect.signature(each).parameters.values() if p.default is p.empty}
     for name, each in vars(agents).items()
@@ -178,7 +177,7 @@ def test_plants_that_one_kind_alone_refuses():
     without = Parameters(setpoint_window=0)
     PIController(error_index=0).check_environment(without, "", 5)
     with pytest.raises(ValueError, match="newest setpoint as element 0"):
-        NeuralSmithPredictor(**PLANT, error_index=0).check_environment(without, "", 5)
+        NeuralSmithPredictor(**STEP_TEST, error_index=0).check_environment(without, "", 5)
     for loops in (None, 2):
         with pytest.raises(ValueError, match="num_envs=3, one loop per episode"):
             DirectNNController(num_envs=loops).check_environment(Parameters(), "", 3)
@@ -449,19 +448,19 @@ BAD = {
         ("n_inputs", 0), ("n_hidden", 1.5), ("eta", -0.1), ("eta_1", np.nan), ("seed", "1"),
         ("direction", 0.5), ("num_envs", True), ("update_interval", 0), ("learning", "no"),
     ],
-    partial(PIController.simc, **PLANT): [
+    partial(PIController.simc, **STEP_TEST): [
         ("gain", 0.0), ("time_constant", 0.0), ("delay", -1.0), ("u_min", 10.0),
         ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0), ("u_min", -np.inf),
     ],
     partial(SmithPredictor, **TOLD): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
-    partial(NeuralSmithPredictor, **PLANT): [
+    partial(NeuralSmithPredictor, **STEP_TEST): [
         ("gain", 0.0), ("time_constant", 0.0), ("delay", 1e12), ("uncertainty", np.nan),
     ],
-    partial(SelfTuningController, **PLANT): [
+    partial(SelfTuningController, **STEP_TEST): [
         ("shortest_delay_samples", 0), ("longest_delay_samples", 6), ("forgetting", 0.0),
         ("longest_delay_samples", 10**9), ("forgetting", 1.1),
     ],
-    partial(NeuralSelfTuningController, **PLANT): [("aggressiveness", -1)],
+    partial(NeuralSelfTuningController, **STEP_TEST): [("aggressiveness", -1)],
     policy: [
         ("observation", {"window": 5}), ("observation", {"output_window": 5.0}),
         ("input_scale", [1.0] * 4), ("input_scale", [1.0] * 4 + [np.inf]),

@@ -9,7 +9,7 @@ from benchmarks.lib.storage import UsageError
 from benchmarks.loop.linear import nominal, step_test
 from benchmarks.loop.scenarios import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters
-from tests.conftest import run
+from tests.conftest import STEP_TEST, run
 
 OTHER = {"delay": 7, "gain_factor": 1.3, "time_constant_factor": 2.0, "dead_zone": 0.0}
 DRIFT = {"gain_drift": 0.6, "time_constant_drift": 1.5, "drift_samples": 90}
@@ -48,7 +48,7 @@ def test_ranges_stand_for_their_middle_and_what_is_added_does_not_show():
 def test_paper_plant_shows_the_numbers_its_controllers_are_tuned_with():
     found = step_test(Parameters())
     # Steady-state gain -0.0496 / 0.0727, the time constant of the pole at 0.9515, 19 samples.
-    assert [*found.values()] == [-0.6825, 161.0, 152.0, 8.0]
+    assert found == {**STEP_TEST, "sampling_interval": 8.0}
     slow = step_test(Parameters(sampling_interval=80.0))
     assert [*slow.values()] == [-0.6825, 1610.0, 1520.0, 80.0]
 
@@ -85,9 +85,6 @@ def test_bad_plant_file_is_named(tmp_path):
             path.write_text(text)
         with pytest.raises(UsageError, match=f"^--plant: .*{complaint}"):
             PlantOptions(plant=path).arguments()
-
-
-STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}  # of the paper's plant
 
 
 @pytest.mark.parametrize(

@@ -10,17 +10,12 @@ import mptc_gym
 from agents import actuator
 from mptc_gym.parameters import PlantNumbers
 from mptc_gym.plant import Plant, action_from_command, float32_action
-from mptc_gym.signals import EpisodeStream, Ranges
+from mptc_gym.signals import EpisodeStream
 from tests.conftest import run
 
 A = [1, -0.45181, -0.47546]
 B = [-0.04560, -0.00404]
 C = [1, -0.35740, -0.03392]
-
-
-def step(action: float, **arguments: float) -> tuple[float, float, float]:
-    parameters = mptc_gym.Parameters(**arguments)
-    return Plant(parameters, Ranges(parameters).given).step(action, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -84,8 +79,9 @@ def test_only_commands_on_the_edge_are_moved_each_by_its_own_limits(scaled, rng)
     commands = rng.uniform(-12, 12, 1000)
     plain = action_from_command(commands, -10.0, 10.0).astype(np.float32)
     np.testing.assert_array_equal(scaled(commands, -10.0, 10.0, 7.0), plain)
-    inside = np.nextafter(7.0, 0.0)  # stays inside
-    assert step(scaled(inside, -10, 10, 7.0).item(), dead_zone=7.0)[1] == 0.0
+    inside = scaled(np.nextafter(7.0, 0.0), -10, 10, 7.0)  # stays inside
+    numbers = PlantNumbers(delay=0.0, dead_zone=7.0, u_min=-10.0, u_max=10.0)
+    assert Plant(mptc_gym.Parameters(), numbers).step(inside.item(), 0.0, 0.0)[1] == 0.0
     zones, limits = np.array([4.1, 6.3, 7.0]), np.array([10.0, 11.0, 12.0])
     alone = [
         scaled(zone, -10.0, limit, zone) for zone, limit in zip(zones, limits, strict=True)

@@ -15,15 +15,15 @@ from agents import (
 )
 from benchmarks.loop.rollout import make_plants, measure, rollout
 from mptc_gym import Parameters
+from tests.conftest import STEP_TEST
 
-SHOWN = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
-STEP_TEST = {**SHOWN, "dead_zone": 5.0}
+TOLD = {**STEP_TEST, "dead_zone": 5.0}
 # Steady-state gain of (28), degC per t/h, and 1 / (1 - p) samples of 8 s, p its slowest pole.
 GAIN = (-0.04560 - 0.00404) / (1.0 - 0.45181 - 0.47546)
 TIME_CONSTANT = 8.0 / (1.0 - 0.95147)
-tuning = partial(SelfTuningController, **STEP_TEST)
+tuning = partial(SelfTuningController, **TOLD)
 neural = partial(NeuralSmithPredictor, network=LawNetwork.load())
-told = partial(neural, **SHOWN)
+told = partial(neural, **STEP_TEST)
 
 
 def control(controller, samples=1200, runs=1, seed=5_900_000, **plant):
@@ -72,7 +72,7 @@ def test_it_follows_a_plant_that_drifts(gain):
     plant = {"gain_factor": gain[0], "gain_drift": gain[1] / gain[0], "noise_variance": 0.05}
     plant |= {"delay": 8, "runs": 3}
     controller = tuning()
-    fixed = SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0)
+    fixed = SmithPredictor(**TOLD, closed_loop_time_constant=80.0)
     ours, theirs = (mean_error(control(each, **plant), 600) for each in (controller, fixed))
     assert ours < theirs - 0.1
     assert controller.estimates["gain"] == pytest.approx(np.full(3, GAIN * gain[1]), rel=0.2)
@@ -92,7 +92,7 @@ def test_it_finds_the_dead_zone_that_it_was_not_told(monkeypatch):
 
 @pytest.mark.parametrize(("shown", "dead_zone"), [(7.0, 7.0), (5.0, 7.5)])
 def test_the_network_does_not_hunt_beside_a_dead_zone(shown, dead_zone):
-    controller = NeuralSelfTuningController(**{**STEP_TEST, "dead_zone": shown})
+    controller = NeuralSelfTuningController(**{**TOLD, "dead_zone": shown})
     found = control(controller, 600, dead_zone=dead_zone, setpoint=5.2)
     assert measure(found, Parameters())["total_variation"] < 80.0
 
@@ -118,7 +118,7 @@ def test_neither_a_wrong_sign_nor_nonsense_leads_it_beyond_its_bounds(rng):
     controller = tuning()
     control(controller, b=[0.04560, 0.00404], runs=2)
     assert (controller.estimates["gain"] <= 0.3 * -0.6825 + 1e-12).all()
-    for controller in (tuning(), NeuralSelfTuningController(**STEP_TEST)):
+    for controller in (tuning(), NeuralSelfTuningController(**TOLD)):
         for scale in (1.0, 1e3, 1e6, 1.0):
             for _ in range(100):
                 controller.act(rng.normal(size=(3, 6)) * scale)
@@ -154,7 +154,7 @@ def seen(rng):
     ],
 )
 def test_the_law_is_that_of_the_training(make, commands, seen):
-    rising = {**SHOWN, "gain": 0.6825}
+    rising = {**STEP_TEST, "gain": 0.6825}
     found = response(make(**rising, dead_zone=5.0, u_min=-10.0, u_max=8.0), *seen)
     assert found[39::40].ravel() == pytest.approx(commands, abs=1e-3)
 
@@ -162,10 +162,15 @@ def test_the_law_is_that_of_the_training(make, commands, seen):
 class TestScales:
     def test_of_flows_temperatures_and_times(self, seen):
         plain = response(told(dead_zone=5.0), *seen)
-        flows = {**SHOWN, "gain": -0.06825, "dead_zone": 50.0, "u_min": -100.0, "u_max": 100.0}
+        flows = STEP_TEST | {
+            "gain": -0.06825,
+            "dead_zone": 50.0,
+            "u_min": -100.0,
+            "u_max": 100.0,
+        }
         # Rounding moves the inputs of the network by a float32.
         np.testing.assert_allclose(response(neural(**flows), *seen), 10.0 * plain, rtol=1e-4)
-        hot = neural(**{**SHOWN, "gain": -2.73}, dead_zone=5.0)
+        hot = neural(**{**STEP_TEST, "gain": -2.73}, dead_zone=5.0)
         stretched = [4.0 * each for each in seen]
         np.testing.assert_allclose(response(hot, *stretched), plain, rtol=1e-4)
         minutes = {"time_constant": 161.0 / 60, "delay": 152.0 / 60}
