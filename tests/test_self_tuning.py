@@ -162,12 +162,7 @@ def test_the_law_is_that_of_the_training(make, commands, seen):
 class TestScales:
     def test_of_flows_temperatures_and_times(self, seen):
         plain = response(told(dead_zone=5.0), *seen)
-        flows = STEP_TEST | {
-            "gain": -0.06825,
-            "dead_zone": 50.0,
-            "u_min": -100.0,
-            "u_max": 100.0,
-        }
+        flows = STEP_TEST | {"gain": -0.06825, "dead_zone": 50, "u_min": -100, "u_max": 100}
         # Rounding moves the inputs of the network by a float32.
         np.testing.assert_allclose(response(neural(**flows), *seen), 10.0 * plain, rtol=1e-4)
         hot = neural(**{**STEP_TEST, "gain": -2.73}, dead_zone=5.0)
