@@ -219,7 +219,7 @@ def _normalisers(env: Any) -> Iterator[tuple[Any, str]]:
 @contextmanager
 def opened(env: Any, n: int, policy: Any = None, /, **arguments: Any) -> Iterator[Any]:
     """Yield plants, frozen. Given ones are reset afterwards, and n that it makes are closed."""
-    given = is_environment(env)
+    given = not isinstance(env, str | EnvSpec) and is_environment(env)
     with ExitStack() as stack:
         plants = _batch(env, n, arguments)
         if not given:
@@ -280,8 +280,6 @@ def _one(make: Callable[[], Any]) -> Env:
 
 def native_batch(single: Env, n: int, **modes: Any) -> Any:
     """Return n of an environment in one batch, or None for a foreign one or its wrappers."""
-    from mptc_gym.wrappers.vector import IncrementalAction  # here: it imports this module
-
     spec, plant = single.spec, single.unwrapped
     if spec is None or type(plant) is not MiddlePointEnv:
         return None
@@ -291,6 +289,8 @@ def native_batch(single: Env, n: int, **modes: Any) -> Any:
     for each in spec.additional_wrappers:
         if each.entry_point != "mptc_gym.wrappers:IncrementalAction":
             return None
+        from mptc_gym.wrappers.vector import IncrementalAction  # here: it imports this module
+
         plants = IncrementalAction(plants, **(each.kwargs or {}))
     return plants
 
@@ -315,8 +315,9 @@ def _restart(plants: Any, policy: Any, last: list[int]) -> None:
 
 def check_fit(policy: Any, plants: Any) -> None:
     """Refuse environments that a policy was not made for, if it is one that can tell."""
-    here, (_, owner) = _traits(plants), behind(policy)
+    _, owner = behind(policy)
     if hasattr(owner, "check_environment"):
+        here = _traits(plants)
         wrapped = ", ".join(here["wrappers"] | here["action wrappers"])
         owner.check_environment(natives(plants)[0].parameters, wrapped, plants.num_envs)
     models = loaded(f"{_SB3}.base_class.BaseAlgorithm"), loaded(f"{_SB3}.policies.BaseModel")
@@ -328,6 +329,7 @@ def check_fit(policy: Any, plants: Any) -> None:
     }
     own = getattr(policy, "env", None)
     if own and not isinstance(plants, FromVecEnv):
+        here = _traits(plants)
         pairs |= {name: (its, here[name]) for name, its in _traits(own).items()}
     for name, (its, found) in pairs.items():
         if its != found:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.linear_program import SMOOTH, TAIL, plan, reference
 from benchmarks.bounds.unknown import unknown
 from benchmarks.lib.statistics import Estimate, student
@@ -144,6 +143,10 @@ def _least(
     else:
         penalty = np.zeros(len(setpoint))
         if kind == "causal" and parameters.setpoint_amplitude > 0.0:
+            from benchmarks.bounds.causal import (
+                SetPointLaw,
+            )  # here: for random set points alone
+
             penalty = SetPointLaw(model, unforeseen).penalty(setpoint)
         error, flow = plan(model, unforeseen, setpoint, penalty=penalty)
         price = penalty * flow

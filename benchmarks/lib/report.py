@@ -80,14 +80,11 @@ def write_report(
     made = f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}\n"
     page = "\n\n".join([*parts, made])
     write_text(folder / "report.md", page)
-
-    def embedded(found: re.Match[str]) -> str:
-        data = base64.b64encode((folder / found[1]).read_bytes()).decode()
-        return f'src="data:image/png;base64,{data}"'
-
     body = markdown.markdown(page, extensions=["tables", "toc"])
     head = f"{_HEAD}<title>{html.escape(title)}</title>"
-    body = re.sub(r'src="([\w.-]+\.png)"', embedded, body)
+    for name in re.findall(r'src="([\w.-]+\.png)"', body):
+        data = base64.b64encode((folder / name).read_bytes()).decode()
+        body = body.replace(f'src="{name}"', f'src="data:image/png;base64,{data}"')
     page = f"{head}\n{body}\n</html>\n"
     write_text(folder / "report.html", page)
     width = shutil.get_terminal_size((150, 24)).columns

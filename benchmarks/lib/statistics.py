@@ -64,7 +64,7 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval()
     low = -np.inf if np.isnan(interval.low) else interval.low
     high = np.inf if np.isnan(interval.high) else interval.high
-    value = percentile(ordered, 100.0 * probability)
+    value = percentiles(ordered, value=100.0 * probability)["value"]
     return Estimate(float(value), float(low), float(high), len(ordered))
 
 
@@ -100,16 +100,13 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
     return Estimate(value, float(low), float(high), together.size)
 
 
-def percentile(values: NDArray[np.float64], at: float, method: Any = "linear") -> Any:
-    """Return a percentile along the last axis.
+def percentiles(
+    values: NDArray[np.float64], method: Any = "linear", **named: float
+) -> dict[str, Any]:
+    """Return percentiles along the last axis, by default the median, the 10th and the 90th.
 
     Infinite values ("not settled") cannot be interpolated: the next higher value is used.
     """
     method = method if np.isfinite(values).all() else "higher"
-    return np.percentile(values, at, axis=-1, method=method)
-
-
-def percentiles(values: NDArray[np.float64], method: str = "linear") -> dict[str, Any]:
-    """Return the median, 10th and 90th percentiles along the last axis."""
-    named = {"median": 50, "p10": 10, "p90": 90}
-    return {name: percentile(values, at, method) for name, at in named.items()}
+    named = named or {"median": 50, "p10": 10, "p90": 90}
+    return {n: np.percentile(values, at, axis=-1, method=method) for n, at in named.items()}

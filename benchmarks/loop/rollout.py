@@ -107,13 +107,12 @@ def rollout(
     agent.reset()
     clock = itertools.count()
 
-    def act(observations: Any) -> Any:
-        if before is not None:
-            before(next(clock))
+    def watched(observations: Any) -> Any:
+        before(next(clock))  # type: ignore[misc]
         return agent.act(observations)
 
     signals = []
-    steps = run_batch(plants, act, samples, seeds)
+    steps = run_batch(plants, watched if before else agent.act, samples, seeds)
     for (at, _), (after, _) in itertools.pairwise(steps):
         # A step reports the command and the applied flow of the sample that it starts at.
         here = at["setpoint"], at["output"], after["command"], after["applied"]
