@@ -188,6 +188,7 @@ class TestSavedPolicies:
         file = zips / f"{name}.zip"
         (member,) = members_of(f"PPO:{file}")
         assert "weights: 0 M samples a policy" in member.provenance["searched"]
+        assert ("note" in member.provenance) == (name == "bare")  # which is told to the user
         controller = member(PRESETS[preset], 3, SEED)
         found = errors(member, 3, 100, **PRESETS[preset])
         model = PPO.load(file, device="cpu")

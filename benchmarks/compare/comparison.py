@@ -235,6 +235,7 @@ def report(
 ) -> list[Section]:
     """Return the sections of the report that have anything to show."""
     reference = str(runs["agent"].iloc[0])
+    notes = {each["note"] for case in cases for each in case.policies if "note" in each}
     paired = difference_table(estimates)
     parts = runs[runs["scenario"] == "hard"].groupby("agent")[[*PARTS]].mean()
     parts = parts.sort_values("mae").map("{:.3f}".format).rename(index=label, columns=PARTS)
@@ -242,7 +243,7 @@ def report(
     sections = [
         Section(
             "Score: 0 without control, 1 at the least possible error",
-            [SCORE],
+            [SCORE, *sorted(notes)],
             score_table(runs, estimates, scores),
             {
                 "scores.png": "The score of each controller, and a tick for each case",

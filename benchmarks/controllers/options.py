@@ -102,16 +102,18 @@ def _saved(location: str) -> Own:
 
     from mptc_gym.sb3 import load
 
-    algorithm, _, file = location.partition(":")
+    (algorithm, _, file), about = location.partition(":"), {}
     try:
         model: Any = load(file, device="cpu")
     except ValueError:  # not of `mptc_gym.sb3.save`
         kind: Any = getattr(stable_baselines3, algorithm, None)
         kind = kind or pkgutil.resolve_name(f"sb3_contrib:{algorithm}")
         model = kind.load(file, device="cpu")
+        about["note"] = f"{file} names no environment: run in the plain one, without wrappers."
     weights = sum(weight.numel() for weight in model.policy.parameters())
     samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
-    return Own(lambda: model, provenance={"searched": f"{weights:,} weights: {samples}"})
+    about["searched"] = f"{weights:,} weights: {samples}"
+    return Own(lambda: model, provenance=about)
 
 
 def _make(*, network: Own, **told: Any) -> Any:

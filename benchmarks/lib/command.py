@@ -252,8 +252,10 @@ class FanOut:
                 yield name, result
         if errors:
             said = f"{len(errors)} of {len(tasks)} tasks failed; the others are done"
-            shown = [f"{name}: {text}" for name, text in errors.items()]
-            raise UnfinishedError("\n".join([said, *shown[:3]]))
+            # Each kind of error once, and the first with its traceback.
+            kinds = {text.splitlines()[-1]: name for name, text in reversed(errors.items())}
+            shown = [f"{name}: {last}" for last, name in kinds.items()]
+            raise UnfinishedError("\n".join([said, *shown[:20], next(iter(errors.values()))]))
 
     def _answers(self, tasks: Mapping[str, Task]) -> Iterator[Answer]:
         """Run tasks, and yield each answer as it comes."""

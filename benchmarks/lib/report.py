@@ -88,6 +88,8 @@ def write_report(
     page = f"{head}\n{body}\n</html>\n"
     write_text(folder / "report.html", page)
     width = shutil.get_terminal_size((150, 24)).columns
+    if "missing" in origin:
+        print(parts[1])
     for section in sections[:printed]:
         for text in filter(None, [section.title, *section.text]):
             print(textwrap.fill(text, width))
