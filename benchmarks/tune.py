@@ -102,9 +102,10 @@ def search(name: str, count: int, runs: int, out: Path) -> list[dict[str, float]
                 )
                 trial = study.ask(spans)
                 task = partial(score, name, runs, FIRST_RUN, trial.params)
-                rows.append(kept.load(task) or task())
-                kept.save(task, rows[-1])
-                study.tell(trial, rows[-1]["objective"])
+                if (row := kept.load(task)) is None:
+                    kept.save(task, row := task())
+                rows.append(row)
+                study.tell(trial, row["objective"])
                 advance()
     finally:
         write_csv(out / "trials.csv", pd.DataFrame(rows))

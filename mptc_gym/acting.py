@@ -219,9 +219,8 @@ def _normalisers(env: Any) -> Iterator[tuple[Any, str]]:
 @contextmanager
 def opened(env: Any, n: int, policy: Any = None, /, **arguments: Any) -> Iterator[Any]:
     """Yield plants, frozen. Given ones are reset afterwards, and n that it makes are closed."""
-    given = not isinstance(env, str | EnvSpec) and is_environment(env)
     with ExitStack() as stack:
-        plants = _batch(env, n, arguments)
+        plants, given = _batch(env, n, arguments)
         if not given:
             stack.callback(plants.close)
         if not natives(plants):
@@ -237,26 +236,26 @@ def opened(env: Any, n: int, policy: Any = None, /, **arguments: Any) -> Iterato
         yield plants
 
 
-def _batch(env: Any, n: int, arguments: Mapping[str, Any]) -> Any:
-    """Return environments of any kind in the form of a vector environment."""
+def _batch(env: Any, n: int, arguments: Mapping[str, Any]) -> tuple[Any, bool]:
+    """Return environments as a vector environment, and whether they are given, not made."""
     if isinstance(env, str | EnvSpec):
         make = partial(make_one, env, arguments)
         single = make()
         plants = native_batch(single, n) or SyncVectorEnv([make] * n)
         plants.unwrapped.spec = single.spec
-        return plants
+        return plants, False
     if arguments:
         raise ValueError(f"{', '.join(arguments)} must be given where env is made")
     if isinstance(env, gymnasium.Env):
         plants = SyncVectorEnv([lambda: env])
         plants.closed = True  # as it is not ours to close
-        return plants
+        return plants, True
     if is_environment(env):
-        return env if isinstance(env, VectorEnv) else FromVecEnv(env)
+        return env if isinstance(env, VectorEnv) else FromVecEnv(env), True
     if not callable(env):
         allowed = "an id, an EnvSpec, environments, or a function that makes one"
         reject("env", env, f"{allowed} (a model that was loaded has no environments)")
-    return SyncVectorEnv([partial(_one, env)] * n)
+    return SyncVectorEnv([partial(_one, env)] * n), False
 
 
 def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
@@ -283,12 +282,13 @@ def native_batch(single: Env, n: int, **modes: Any) -> Any:
     spec, plant = single.spec, single.unwrapped
     if spec is None or type(plant) is not MiddlePointEnv:
         return None
+    wrappers = {each.entry_point for each in spec.additional_wrappers}
+    if wrappers - {"mptc_gym.wrappers:IncrementalAction"}:
+        return None
     modes["max_episode_steps"] = spec.max_episode_steps
     plants: Any = MiddlePointVectorEnv(n, **modes, **asdict(plant.parameters))
     plants.spec = spec
     for each in spec.additional_wrappers:
-        if each.entry_point != "mptc_gym.wrappers:IncrementalAction":
-            return None
         from mptc_gym.wrappers.vector import IncrementalAction  # here: it imports this module
 
         plants = IncrementalAction(plants, **(each.kwargs or {}))

@@ -261,9 +261,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         _, error_head, output_head, action_head, size = self._layout
         # One spare element at the end: see step.
         self._window = [0.0] * action_head + [rest_action] * (size - action_head + 1)
-        newest = {0: setpoint, error_head: setpoint, output_head: 0.0, action_head: rest_action}
-        for head, value in newest.items():  # of empty blocks, too, where the next one begins
-            self._window[head] = value
+        # In this order, as an empty block begins where the next one does.
+        self._window[0] = self._window[error_head] = setpoint
+        self._window[output_head], self._window[action_head] = 0.0, rest_action
         self._ahead.clear()
         if self.render_mode is not None:
             self._record = Record(numbers, parameters.sampling_interval, setpoint)

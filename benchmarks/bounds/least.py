@@ -143,9 +143,7 @@ def _least(
     else:
         penalty = np.zeros(len(setpoint))
         if kind == "causal" and parameters.setpoint_amplitude > 0.0:
-            from benchmarks.bounds.causal import (
-                SetPointLaw,
-            )  # here: for random set points alone
+            from benchmarks.bounds.causal import SetPointLaw  # here: few cases need it
 
             penalty = SetPointLaw(model, unforeseen).penalty(setpoint)
         error, flow = plan(model, unforeseen, setpoint, penalty=penalty)

@@ -68,9 +68,8 @@ def write_report(
     called = sys.argv[1:] if command in sys.argv[0] else []
     line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
     commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty"
-    parts = [f"# {title}"]
-    if "missing" in origin:
-        parts.append(f"**Unfinished: {origin['missing']}.**")
+    unfinished = [f"**Unfinished: {origin['missing']}.**"] if "missing" in origin else []
+    parts = [f"# {title}", *unfinished]
     for section in sections:
         parts += [f"## {section.title}"] * bool(section.title) + [*section.text]
         if section.table is not None:
@@ -88,8 +87,8 @@ def write_report(
     page = f"{head}\n{body}\n</html>\n"
     write_text(folder / "report.html", page)
     width = shutil.get_terminal_size((150, 24)).columns
-    if "missing" in origin:
-        print(parts[1])
+    for text in unfinished:
+        print(text)
     for section in sections[:printed]:
         for text in filter(None, [section.title, *section.text]):
             print(textwrap.fill(text, width))

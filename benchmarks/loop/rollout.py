@@ -2,8 +2,9 @@
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import gymnasium
@@ -105,19 +106,19 @@ def rollout(
     """
     seeds = [*range(seed, seed + plants.num_envs)]
     agent.reset()
-    clock = itertools.count()
-
-    def watched(observations: Any) -> Any:
-        before(next(clock))  # type: ignore[misc]
-        return agent.act(observations)
-
-    signals = []
-    steps = run_batch(plants, watched if before else agent.act, samples, seeds)
+    act = partial(_watched, before, itertools.count(), agent.act) if before else agent.act
+    signals, steps = [], run_batch(plants, act, samples, seeds)
     for (at, _), (after, _) in itertools.pairwise(steps):
         # A step reports the command and the applied flow of the sample that it starts at.
         here = at["setpoint"], at["output"], after["command"], after["applied"]
         signals.append(np.array([*here, after["error"], after["setpoint"]]))
     return Trajectory(*np.stack(signals, axis=1))
+
+
+def _watched(before: Callable[[int], object], clock: Iterator[int], act: Any, seen: Any) -> Any:
+    """Call `before` with k, and return the actions for observations."""
+    before(next(clock))
+    return act(seen)
 
 
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
