@@ -210,14 +210,16 @@ class PlantBatch:
             outputs[which] = 0.0
         for name, values in numbers.chosen(self._drawn).items():
             getattr(self._numbers, name)[which] = values
-        self._update_actuator()
+        if self._drawn:
+            self._update_actuator()
         if self._own_delays:
             first = self._longest - numbers.delay.astype(np.intp)
             rows = np.arange(len(self._taken))[:, np.newaxis] + first
             self._taken[:, which] = rows * self._num_envs + which
         if self._drifts:
             self._starts[which] = self._clock
-        self._update_dynamics()
+        if self._drawn or self._drifts:
+            self._update_dynamics()
 
     def step(
         self, action: Values, noise: Values, load: Values | None = None
