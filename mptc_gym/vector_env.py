@@ -220,10 +220,12 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         n, seeds = self.num_envs, plain(seed)
         if seed is None or is_count(seed):
-            seeds = [None if seed is None else int(seed) + i for i in range(n)]
-        fits = isinstance(seeds, list | tuple) and len(seeds) == n
-        if not fits or not all(each is None or is_count(each) for each in seeds):
-            reject("seed", seed, f"an integer of at least 0, or a list of {n} of them or None")
+            seeds = [None] * n if seed is None else range(int(seed), int(seed) + n)
+        else:
+            fits = isinstance(seeds, list | tuple) and len(seeds) == n
+            if not fits or not all(each is None or is_count(each) for each in seeds):
+                allowed = f"an integer of at least 0, or a list of {n} of them or None"
+                reject("seed", seed, allowed)
         for i in np.flatnonzero(mask).tolist():
             own = seeds[i]
             if own is None and i not in self._streams:
