@@ -16,6 +16,7 @@ from mptc_gym import evaluation
 from mptc_gym.parameters import argument_table
 
 ROOT = Path(__file__).parent.parent
+CONTRIBUTING = ".github/CONTRIBUTING.md"
 SHOWN = {".csv", ".gif", ".ipynb", ".json", ".md", ".png", ".txt", ".yml"}
 TABLE = markdown.markdown(argument_table(), extensions=["tables"])
 CONSTANTS = re.compile(r'<span class="n">(SEED|EPISODES)</span>')  # in signatures
@@ -29,7 +30,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True)
     for name in tracked.splitlines():
         path = ROOT / name
-        if name.startswith((".", "tests")) or not path.exists():
+        if name.startswith((".", "tests")) and name != CONTRIBUTING or not path.exists():
             continue
         if path.suffix in SHOWN or name == "LICENSE":
             files.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
