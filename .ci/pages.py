@@ -30,7 +30,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True)
     for name in tracked.splitlines():
         path = ROOT / name
-        if name.startswith((".", "tests")) and name != CONTRIBUTING or not path.exists():
+        if (name.startswith((".", "tests")) and name != CONTRIBUTING) or not path.exists():
             continue
         if path.suffix in SHOWN or name == "LICENSE":
             files.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
