@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import linalg, optimize, signal
 
+from benchmarks import sweep
 from benchmarks.bounds import __main__ as command
 from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
@@ -17,6 +18,7 @@ from benchmarks.bounds.unknown import noise_variance, unknown
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
+from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 from mptc_gym.plant import action_from_command
 from mptc_gym.signals import Ranges
@@ -237,6 +239,20 @@ class TestCausal:
 
 
 class TestLeastPossible:
+    def test_an_error_of_the_solver_is_no_missing_reference(self, monkeypatch):
+        def fails(*_):
+            raise np.linalg.LinAlgError("Singular matrix")  # a ValueError, too
+
+        assert issubclass(np.linalg.LinAlgError, ValueError)
+        monkeypatch.setattr("benchmarks.bounds.least.reference", fails)
+        case = {"setpoint": "square", "setpoint_period": 600}
+        with pytest.raises(np.linalg.LinAlgError):
+            least_possible(samples=1201, **case)
+        with pytest.raises(np.linalg.LinAlgError):
+            command.row(Scenario("a", "b", 1201, case), 1201, {"episodes": 1, "seed": 0}, None)
+        with pytest.raises(np.linalg.LinAlgError):
+            sweep.scale_of({**case, "delay": 17}, 1)
+
     def test_score(self):
         least = least_possible(samples=600, setpoint=5.0)
         idle = least.idle.value
