@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from benchmarks.lib.command import finish
-from benchmarks.lib.storage import UsageError
+from benchmarks.lib.errors import UsageError
 
 FOLDER = Path(__file__).parent
 

@@ -11,7 +11,8 @@ import gymnasium
 import numpy as np
 
 from benchmarks.lib.command import Count, Names, Parameter, command, options
-from benchmarks.lib.storage import UnfinishedError, out_folder
+from benchmarks.lib.errors import UnfinishedError
+from benchmarks.lib.storage import out_folder
 from mptc_gym import PRESETS, evaluate
 
 SAMPLES, EPISODES = 1200, 100  # per episode, and per data set

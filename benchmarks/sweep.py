@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER, Controller, label
 from benchmarks.lib.command import Folder, Parameter, Runs, Seed, blame, command, options
-from benchmarks.lib.storage import Kept, UsageError, origin, out_folder, write_csv, write_json
+from benchmarks.lib.errors import NoBoundError, UsageError
+from benchmarks.lib.provenance import origin
+from benchmarks.lib.results import KeptResults, conditions_of, results_folder
+from benchmarks.lib.storage import write_csv, write_json
 from benchmarks.loop.rollout import Trajectory, held, measure
 from benchmarks.loop.scenarios import Arguments, PlantOptions, around, random_design
 from mptc_gym import Parameters
@@ -98,7 +101,7 @@ def work(options: Options) -> str:
     members = {name: each.members() for name, each in made_by.items()}
     nominal = options.plant.arguments()
     plants = design(options, nominal)
-    made, out = origin(), out_folder(options.out or Path(f"results/sweep-{options.design}"))
+    made = origin()
     tasks: dict[str, Any] = {}
     for i, plant in enumerate(plants):
         case = {**nominal, **plant, **SETPOINT}
@@ -108,21 +111,24 @@ def work(options: Options) -> str:
             # The plants take the members in turn, so that the maps show how much they differ.
             member = of[i % len(of)]
             tasks[f"plant {i}, {name}"] = partial(run_agent, member, told, case, options.runs)
+    target = options.out or Path(f"results/sweep-{options.design}")
+    # The conditions do not cover the code of a user's own controller.
+    conditions = None if options.controllers.agent else conditions_of("sweep", options)
     found: dict[str, Any] = {}
-    try:
-        # The code of a user's own may change without a new commit.
-        kept = None if options.controllers.agent else Kept(out / "tasks")
-        found.update(options.controllers.fan_out.stream(tasks, "sweep", kept))
-    finally:
-        runs = table(plants, list(members), found)
-        if missing := len(tasks) - len(found):
-            made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
-        if not runs.empty:
-            write_json(out / "provenance.json", made | {"options": asdict(options)})
-            write_csv(out / "runs.csv", runs)
-            write_csv(out / "summary.csv", summarise(runs))
-            report(runs, out, Parameters(**nominal), made)
-    return f"The report, the data and a map are in {out}/"
+    with results_folder(target, conditions) as folder:
+        kept = KeptResults(folder) if conditions else None
+        try:
+            found.update(options.controllers.fan_out.stream(tasks, "sweep", kept))
+        finally:
+            runs = table(plants, list(members), found)
+            if missing := len(tasks) - len(found):
+                made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
+            if not runs.empty:
+                write_json(folder / "provenance.json", made | {"options": asdict(options)})
+                write_csv(folder / "runs.csv", runs)
+                write_csv(folder / "summary.csv", summarise(runs))
+                report(runs, folder, Parameters(**nominal), made)
+    return f"The report, the data and a map are in {target}/"
 
 
 def design(options: Options, nominal: Arguments) -> list[Arguments]:
@@ -151,11 +157,11 @@ def run_agent(
 
 
 def scale_of(case: Arguments, runs: int) -> dict[str, Any]:
-    """Run no control on a plant; add the reference (`limit`), NaN if it does not settle."""
+    """Run no control on a plant; add the reference (`limit`), NaN if there is none."""
     from benchmarks.bounds.least import least_possible
 
     found = {**run_agent(ROSTER["nothing"], case, case, runs), "limit": math.nan}
-    with suppress(ValueError):
+    with suppress(NoBoundError):  # the plant does not settle
         found["limit"] = least_possible(samples=SAMPLES, kind="reference", **case).value
     return found
 
@@ -213,7 +219,7 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) 
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
         if asked and "gain_drift" in runs and len(compared := differences(runs, asked)):
             sections.append(Section(title, [DIFFERENCES], compared))
-    write_report(out, "Controllers on other plants", sections, "sweep", made)
+    write_report(out, "Controllers on other plants", sections, made)
 
 
 def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:

@@ -4,14 +4,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Folder, Parameter, Runs, command, options, progress_bar
-from benchmarks.lib.storage import Kept, origin, out_folder, write_csv
+from benchmarks.lib.provenance import origin
+from benchmarks.lib.results import KeptResults, conditions_of, results_folder
+from benchmarks.lib.storage import write_csv
 from benchmarks.loop.rollout import mean_error, settled
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SEED = 1_000_000  # of the search
 STARTUP = 200  # trials at random before the sampler learns
@@ -45,9 +50,8 @@ CASES: dict[str, tuple[int, int, dict[str, float]]] = {
 class Options:
     """Tune a controller's gains with Optuna.
 
-    All trials use the same set points and seeds, which no comparison uses. Finished trials are
-    kept, if no file of the checkout differs from its commit: the same command, run again, goes
-    on from there and gives the same result.
+    All trials use the same set points and seeds, which no comparison uses. If a search was
+    stopped, the same command with the same code goes on from there, to the same result.
     """
 
     controller: Annotated[str, Parameter(choices=TUNED)] = field(kw_only=False)
@@ -66,21 +70,30 @@ def work(options: Options) -> str:
     from benchmarks.lib.report import Section, write_report
 
     name, made = options.controller, origin()
-    out = out_folder(options.out / name)
-    trials = pd.DataFrame(search(name, options.trials, options.runs, out))
-    # The best gains of a search owe some of their result to luck; new runs show how much.
+    target = options.out / name
+    with results_folder(target, conditions_of("tune", options)) as folder:
+        trials = pd.DataFrame(search(name, options.trials, options.runs, folder))
+        title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS} new runs"
+        sections = [Section(title, [NOTE], finals(name, trials))]
+        write_report(folder, f"Gains: {ROSTER[name].label}", sections, made)
+    return f"All trials are in {target}/trials.csv, the best in {target}/report.md"
+
+
+def finals(name: str, trials: "pd.DataFrame") -> "pd.DataFrame":
+    """Score the best trials on new runs, and return them as text, a row each, the best first.
+
+    The best gains of a search owe some of their result to luck; new runs show how much.
+    """
+    import pandas as pd
+
     best = trials.nsmallest(FINALISTS, "objective")
     gains = best[[*TUNED[name]]].map(lambda gain: float(f"{gain:.3g}")).to_dict("records")
     table = pd.DataFrame([score(name, FINAL_RUNS, FINAL_FIRST_RUN, each) for each in gains])
     table["in the search"] = best["objective"].to_numpy()
-    table = table.sort_values("objective", ignore_index=True).map("{:.4g}".format)
-    title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS} new runs"
-    sections = [Section(title, [NOTE], table)]
-    write_report(out, f"Gains: {ROSTER[name].label}", sections, "tune", made)
-    return f"All trials are in {out}/trials.csv, the best in {out}/report.md"
+    return table.sort_values("objective", ignore_index=True).map("{:.4g}".format)
 
 
-def search(name: str, count: int, runs: int, out: Path) -> list[dict[str, float]]:
+def search(name: str, count: int, runs: int, folder: Path) -> list[dict[str, float]]:
     """Try gains of a controller, and return and write one row for each trial.
 
     What a trial tries follows from those before it. So an interrupted search takes the same
@@ -90,7 +103,7 @@ def search(name: str, count: int, runs: int, out: Path) -> list[dict[str, float]
     import pandas as pd
 
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
-    study, kept = optuna.create_study(), Kept(out / "tasks")
+    study, kept = optuna.create_study(), KeptResults(folder)
     scale = partial(optuna.distributions.FloatDistribution, log=True)
     spans: Any = {each: scale(*span) for each, span in TUNED[name].items()}
     rows: list[dict[str, float]] = []
@@ -101,14 +114,16 @@ def search(name: str, count: int, runs: int, out: Path) -> list[dict[str, float]
                     seed=SEED + i, n_startup_trials=STARTUP, multivariate=True
                 )
                 trial = study.ask(spans)
-                task = partial(score, name, runs, FIRST_RUN, trial.params)
-                if (row := kept.load(task)) is None:
-                    kept.save(task, row := task())
+                row = kept.load(f"trial {i}")
+                if row is None:
+                    row = score(name, runs, FIRST_RUN, trial.params)
+                    kept.save(f"trial {i}", row)
                 rows.append(row)
                 study.tell(trial, row["objective"])
                 advance()
     finally:
-        write_csv(out / "trials.csv", pd.DataFrame(rows))
+        if rows:
+            write_csv(folder / "trials.csv", pd.DataFrame(rows))
     return rows
 
 

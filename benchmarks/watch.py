@@ -11,13 +11,19 @@ from numpy.typing import NDArray
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER, Controller
 from benchmarks.lib.command import Seed, command, known, options
-from benchmarks.lib.storage import UsageError, out_folder, replacing
+from benchmarks.lib.errors import UsageError
+from benchmarks.lib.storage import file_name, out_folder, replacing
 from benchmarks.loop.rollout import held
 from benchmarks.loop.scenarios import SCENARIOS, PlantOptions, Scenario
 
 REFERENCE = ROSTER["nn-smith"]  # whose errors those of the film are multiples of
 PICTURES = 60  # of a film, after the first
-STYLE: Any = {"font.size": 15, "axes.spines.top": False, "axes.spines.right": False}
+STYLE: Any = {
+    "font.size": 15,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "text.parse_math": False,  # names of controllers may have a dollar
+}
 
 
 @options
@@ -44,7 +50,8 @@ def work(options: Options) -> str:
     own = "=" in options.agent
     names = [] if own else known("--agent", [options.agent], ROSTER)
     (controller,) = chosen(names, [options.agent] if own else []).values()
-    path = options.video or Path("results/watch", f"{controller.name}-{case.name}.gif")
+    name = f"{file_name(controller.name)}-{case.name}.gif"
+    path = options.video or Path("results/watch", name)
     if path.suffix != ".gif":
         raise UsageError(f"--video: must end in .gif, got {path}")
     out_folder(path.absolute().parent, "--video")

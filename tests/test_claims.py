@@ -61,7 +61,7 @@ class TestVerdicts:
             ["a number", "12.3", "0.123 to 1,234", "", ""],
             ["a number", "0.000", "? to never", "", ""],
             ["another (t/h)", "0.500", "exact", "", ""],
-            ["the last", "0.500", "exact", "at most 0.4", "**no**"],
+            ["the last", "0.500", "exact", "at most 0.4", "no"],
         ]
         assert of_none.table is None
         assert list(numbers["claim"]) == ["good"] * 5 + ["none"]
@@ -90,15 +90,19 @@ class TestCommand:
     def test_what_has_finished_is_written(self, tmp_path, monkeypatch, capsys):
         fails = Claim("", "", "", Mock(side_effect=ArithmeticError("no weights")))
         monkeypatch.setitem(CLAIMS, "noise", fails)
-        given = ["--jobs", "1", "--runs", "4", "--out", str(tmp_path), "noise", "direction"]
+        out = tmp_path / "out"
+        given = ["--jobs", "1", "--runs", "4", "--out", str(out), "noise", "direction"]
         assert main(given) == 1
-        found = pd.read_csv(tmp_path / "claims.csv")
+        assert not out.exists()
+        folder = tmp_path / "out.unfinished"
+        found = pd.read_csv(folder / "claims.csv")
         assert set(found["claim"]) == {"direction"}
         assert found["value"].iloc[1] == 100.0  # all of them diverge in the end ...
         assert found["shown"].iloc[1] == "undecided"  # ... but four prove little
         shown = capsys.readouterr().out
         assert "no weights" in shown
-        for each in (shown, (tmp_path / "report.md").read_text()):
+        for each in (shown, (folder / "report.md").read_text()):
+            assert "Unfinished: 1 of 2 claims are missing." in each
             assert "Training with -D(G) diverges at once" in each
 
     def test_short_runs_of_all_claims_give_the_numbers_that_they_gave(self, monkeypatch):

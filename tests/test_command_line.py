@@ -217,7 +217,7 @@ class TestEnds:
             os.killpg(run.pid, number)  # as a terminal sends it
         out, err = run.communicate(timeout=60)
         assert run.returncode == 128 + sent[0]
-        assert out.endswith("\nInterrupted: what has finished is written.\n")
+        assert out.endswith("\nInterrupted.\n")
         assert err == ""
         assert [path.name for path in tmp_path.iterdir()] == ["report.md"]
 

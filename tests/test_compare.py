@@ -5,9 +5,12 @@ import json
 import math
 import os
 import re
-from dataclasses import replace
+import sys
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
+from xml.etree import ElementTree
 
 import matplotlib.image
 import numpy as np
@@ -21,6 +24,8 @@ from benchmarks.compare.__main__ import main
 from benchmarks.compare.comparison import estimate, ranked, scale_of
 from benchmarks.controllers.roster import ROSTER, looks
 from benchmarks.lib import storage
+from benchmarks.lib.command import command
+from benchmarks.lib.provenance import origin
 from benchmarks.lib.report import Section, on_screen, write_report
 from benchmarks.loop.rollout import make_plants, measure, rollout
 from benchmarks.loop.scenarios import SCENARIOS
@@ -29,6 +34,12 @@ from mptc_gym.evaluation import SEED
 from tests.conftest import ROOT, trajectory
 
 GOLDEN = Path(__file__).parent / "golden"  # numbers of earlier versions
+
+
+def body_of(path):
+    """Return what a report in HTML shows as well-formed XML."""
+    page = path.read_text()
+    return f"<body>{page[page.index('</title>') + 8 : page.index('</html>')]}</body>"
 
 
 def measured(runs, **arguments):
@@ -96,7 +107,7 @@ def some_runs(**errors):
 
 class TestEstimates:
     def test_by_hand(self):
-        scale = scale_of(SCENARIOS["constant"], 3)
+        scale = scale_of(SCENARIOS["constant"], 3, SEED)
         limit = scale.least.value
         runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
         found = estimate(runs.assign(scenario="constant"), {"constant": scale})
@@ -110,7 +121,7 @@ class TestEstimates:
         assert nn["mean"].low < nn["mean"].value < nn["mean"].high
 
     def test_a_score_by_hand_and_the_best_comes_first(self):
-        scales = {name: scale_of(SCENARIOS[name], 1) for name in ("constant", "square")}
+        scales = {name: scale_of(SCENARIOS[name], 1, SEED) for name in ("constant", "square")}
         rows = []
         for name, scale in scales.items():
             least, idle = scale.least.value, scale.least.idle.value
@@ -128,28 +139,30 @@ class TestEstimates:
         assert (other["controller"], other["constant"]) == ("a", "0.25")
 
     def test_runs_that_are_alike_are_what_each_of_them_is(self, monkeypatch):
-        once = comparison.run_case(SCENARIOS["constant"], ROSTER["smith"], 3)
+        once = comparison.run_case(SCENARIOS["constant"], ROSTER["smith"], 3, SEED)
         monkeypatch.setattr(comparison, "is_random", lambda _: True)
-        each = comparison.run_case(SCENARIOS["constant"], ROSTER["smith"], 3)
+        each = comparison.run_case(SCENARIOS["constant"], ROSTER["smith"], 3, SEED)
         pd.testing.assert_frame_equal(once.runs, each.runs, rtol=1e-12)
         pd.testing.assert_frame_equal(once.responses, each.responses, rtol=1e-12)
+
+
+MADE = {"started": "made today", "commit": 10 * "abcd" + "-dirty", "command": "python -m x"}
+HOSTILE = "<script>alert(1)</script>|<b>|[a](javascript:x) *b* `c` \\| _d_\n\n# e &lt;"
 
 
 class TestReport:
     def test_pages(self, tmp_path):
         (tmp_path / "picture.png").write_bytes(b"\x89PNG")
-        table = pd.DataFrame({"name": ["**a < b**"], "value": ["1.0 (0.9 to 1.1)"]})
+        table = pd.DataFrame({"name": ["a < b", "c"], "value": ["1.0 (0.9 to 1.1)", "[1, 2]"]})
         pictures = {"picture.png": "What it shows"}
-        sections = [Section("First", ["Some text."], table, pictures), Section("Second")]
-        made = {"started": "made today", "commit": 10 * "abcd" + "-dirty"}
-        write_report(tmp_path, "Title", sections, "compare", made)
+        first = Section("First", ["Some text."], table, ["a < b"], pictures)
+        write_report(tmp_path, "Title", [first, Section("Second")], MADE)
         page = (tmp_path / "report.md").read_text()
         assert page.startswith("# Title\n\n## First\n\nSome text.\n\n| name")
-        assert page.endswith(
-            "\n\nmade today, commit abcdabcdabcd-dirty: python -m benchmarks.compare\n"
-        )
+        assert page.endswith("\n\nmade today, commit abcdabcdabcd-dirty: python -m x\n")
         assert "![What it shows](picture.png)" in page
-        assert "| **a < b** | 1.0 (0.9 to 1.1) |" in page
+        assert "| **a &lt; b** | 1.0 (0.9 to 1.1) |" in page
+        assert "| [1, 2] " in page
         html = (tmp_path / "report.html").read_text()
         for part in (
             "<strong>a &lt; b</strong>", 'name="viewport"', "made today", ">First</h2>",
@@ -158,6 +171,45 @@ class TestReport:
         ):  # fmt: skip
             assert part in html
         assert "http" not in html  # nothing is fetched
+
+    def test_texts_from_outside_are_shown_as_they_are(self, tmp_path):
+        (tmp_path / "picture.png").touch()
+        table = pd.DataFrame({HOSTILE: [HOSTILE, "x"], "value": ["1", HOSTILE]})
+        sections = [Section(HOSTILE, [HOSTILE], table, [], {"picture.png": HOSTILE})]
+        origin = {**MADE, "command": HOSTILE, "missing": HOSTILE}
+        write_report(tmp_path, HOSTILE, sections, origin)
+        page = ElementTree.fromstring(body_of(tmp_path / "report.html"))
+        shown = " ".join(HOSTILE.split())
+        texts = ["".join(element.itertext()).strip() for element in page.iter()]
+        # Title, section, paragraph, heading of the table, two cells; then with words beside it.
+        assert texts.count(shown) == 6
+        assert {f"Unfinished: {shown}.", "x", "1"} <= {*texts}
+        assert texts[-1].endswith(f": {shown}")
+        (picture,) = page.iter("img")
+        assert picture.get("alt") == shown
+        tags = {element.tag for element in page.iter()}
+        assert not tags & {"script", "b", "a", "em", "code"}
+        assert [len(row) for row in page.iter("tr")] == [2, 2, 2]
+
+    def test_the_command_line_is_what_was_called(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(sys, "argv", ["/home/compare/bin/pytest", "--secret"])
+        given = ["idle", "--runs", "3"]
+        lines = []
+
+        @dataclass
+        class Options:
+            name: str
+            runs: int = 1
+
+        def work(_):
+            write_report(tmp_path, "Title", [], origin())
+            lines.append((tmp_path / "report.md").read_text().splitlines()[-1])
+            return ""
+
+        command("compare", Options, work)(given)
+        work(None)  # from Python
+        assert lines[0].endswith(": python -m benchmarks.compare idle --runs 3")
+        assert lines[1].endswith(": called from Python")
 
     @pytest.mark.parametrize("width", [60, 200])
     def test_on_screen_nothing_is_cut(self, width, monkeypatch):
@@ -195,14 +247,14 @@ def test_a_controller_has_one_look_wherever_it_is_listed():
 
 @pytest.fixture
 def compared(tmp_path):
-    """Return a function that compares, and returns the folder of the results."""
+    """Return a function that compares, and returns the folder of what has finished."""
 
     def compared(options, *more, status=0):
         out = tmp_path / "out"
         # In this process, unless an option says otherwise.
         given = ["--out", out, "--jobs", 1, *options.split(), *more]
         assert main([str(each) for each in given]) == status
-        return out
+        return out.with_name("out.unfinished") if status else out
 
     return compared
 
@@ -278,6 +330,7 @@ class TestCompare:
         assert "2 of 4 tasks failed; the others are done" in said
         assert "bad, constant: " in said
         assert "--agent: 'my_controllers:Mine' cannot be loaded: AttributeError" in said
+        assert not (tmp_path / "out").exists()
         assert "**Unfinished: 2 of 4 tasks are missing.**" in (out / "report.md").read_text()
         assert "2 of 4" in json.loads((out / "provenance.json").read_text())["missing"]
 
@@ -299,10 +352,45 @@ class TestCompare:
         assert estimates.loc["pi", "mean_low"] == estimates.loc["pi", "mean_high"]
 
     @pytest.mark.usefixtures("undrawn")
+    def test_a_seed_is_that_of_the_runs_and_of_their_bounds(self, compared):
+        given = "--presets --agents smith --scenarios randomised --runs 2"
+        published = pd.read_csv(compared(given) / "estimates.csv")
+        out = compared(f"{given} --seed 5000000")
+        assert pd.read_csv(out / "runs.csv")["seed"].tolist() == [5_000_000, 5_000_001]
+        assert json.loads((out / "provenance.json").read_text())["seeds"] == [5000000, 5000001]
+        (limit,) = pd.read_csv(out / "estimates.csv")["limit"]
+        arguments = PRESETS["randomised"]
+        least = least_possible(samples=1200, episodes=2, seed=5_000_000, **arguments)
+        assert limit == pytest.approx(least.value)
+        assert limit != pytest.approx(published["limit"].iloc[0], rel=1e-3)
+
+    @pytest.mark.usefixtures("undrawn")
+    def test_of_more_cases_before_no_file_is_left(self, compared, monkeypatch):
+        out = compared("--agents pi --scenarios constant load --runs 1")
+        assert (out / "load.csv").exists()
+        compared("--agents pi --scenarios constant --runs 1")
+        assert not (out / "load.csv").exists()
+        before = {file.name: file.read_bytes() for file in out.iterdir()}
+        run = comparison.run_case
+        once = Mock(side_effect=[run(SCENARIOS["load"], ROSTER["pi"], 1, 0), KeyboardInterrupt])
+        monkeypatch.setattr(comparison, "run_case", once)
+        part = compared("--agents pi --scenarios constant load --runs 1", status=130)
+        assert "Unfinished: " in (part / "report.md").read_text()
+        assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+
+    def test_a_controller_may_have_any_name(self, compared):
+        name = "<i>|$\\nope$ ../../x"
+        option = "--agents --scenarios constant --runs 1"
+        out = compared(option, "--agent", f"{name}=agents:PIController")
+        page = ElementTree.fromstring(body_of(out / "report.html"))
+        assert name in {cell.text for cell in page.iter("td")}
+        assert set(pd.read_csv(out / "runs.csv")["agent"]) == {name}
+        assert (out / "scores.png").exists()
+
+    @pytest.mark.usefixtures("undrawn")
     def test_where_limits_are_drawn_shares_are_not_measured(self, monkeypatch, tmp_path):
         monkeypatch.chdir(tmp_path)
         given = "--set u_max=[8,12] --scenarios constant --agents pi --runs 2 --jobs 1"
         assert main(given.split()) == 0
-        (folder,) = (tmp_path / "results").iterdir()  # of its own, as it is a part
-        assert folder.name == "compare-other"
+        folder = tmp_path / "results/compare-plant"
         assert pd.read_csv(folder / "runs.csv")["saturation_share"].isna().all()

@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from benchmarks.compare.comparison import run_case
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.storage import UsageError
+from benchmarks.lib.errors import UsageError
 from benchmarks.loop.rollout import mean_error
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import IDS, PRESETS, Parameters, evaluate

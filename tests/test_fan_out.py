@@ -11,9 +11,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.lib import storage
 from benchmarks.lib.command import FanOut
-from benchmarks.lib.storage import Kept, UnfinishedError, UsageError
+from benchmarks.lib.errors import UnfinishedError, UsageError
 from tests.conftest import ROOT, python
 
 
@@ -43,8 +42,8 @@ def work(n, calls=None):
     return {f"plant {seed}": partial(draw, seed, calls) for seed in range(n)}
 
 
-def run(given, folder=None, jobs=2):
-    return dict(FanOut(jobs=jobs).stream(given, kept=folder and Kept(folder)))
+def run(given, jobs=2):
+    return dict(FanOut(jobs=jobs).stream(given))
 
 
 def test_jobs_and_order_do_not_matter():
@@ -73,43 +72,6 @@ def test_a_killed_process_is_a_sentence():
     with pytest.raises(UnfinishedError, match="killed, perhaps for lack of memory: try fewer"):
         run({**work(2), "the killer": die_of_memory})
     assert run(work(2))  # with new processes
-
-
-class TestKept:
-    def test_a_damaged_result_is_made_again(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(storage, "commit", lambda: "c0ffee")
-        whole = run(work(3), tmp_path, jobs=1)
-        file = sorted(tmp_path.rglob("*.pkl"))[1]
-        kept = file.read_bytes()
-        for damaged in (kept[: len(kept) // 2], b"\xff", b""):
-            file.write_bytes(damaged)
-            assert run(work(3), tmp_path, jobs=1) == whole
-            assert file.read_bytes() == kept
-
-    def test_nothing_is_taken_from_another_commit_or_kept_of_edited_code(
-        self, tmp_path, monkeypatch
-    ):
-        (calls := tmp_path / "calls").mkdir()
-        for name, drawn in (("a", 1), ("a", 1), ("b", 2), ("a-dirty", 3), ("a-dirty", 4)):
-            monkeypatch.setattr(storage, "commit", partial(str, name))
-            run(work(1, calls), tmp_path / "out", jobs=1)
-            assert len([*calls.iterdir()]) == drawn, name
-        assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a", "b"]
-
-
-def test_the_commit_says_whether_files_differ(tmp_path, monkeypatch):
-    monkeypatch.setattr(storage, "ROOT", tmp_path)
-    commit = storage.commit.__wrapped__
-    assert commit() == ""
-    env = {"HOME": str(tmp_path), "PATH": os.environ["PATH"]}
-    code = (
-        "from subprocess import run; git = ['git', '-c', 'user.name=a', '-c', 'user.email=a']\n"
-        "run([*git, 'init', '-q']); run([*git, 'commit', '-q', '--allow-empty', '-m', 'a'])"
-    )
-    python("-c", code, cwd=tmp_path, env=env, check=True)
-    assert len(commit()) == 40
-    (tmp_path / "mine.py").touch()
-    assert commit().endswith("-dirty")
 
 
 RAY = """

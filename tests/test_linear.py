@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from agents import PIController, SmithPredictor
-from benchmarks.lib.storage import UsageError
+from benchmarks.lib.errors import UsageError
 from benchmarks.loop.linear import nominal, step_test
 from benchmarks.loop.scenarios import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters

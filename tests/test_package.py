@@ -60,7 +60,8 @@ EXAMPLES = [
 
 
 COMPARE = {  # the extra
-    "cyclopts", "joblib", "markdown", "matplotlib", "pandas", "rich", "scipy", "tabulate",
+    "cyclopts", "filelock", "joblib", "markdown", "matplotlib", "pandas", "rich", "scipy",
+    "tabulate",
 }  # fmt: skip
 
 

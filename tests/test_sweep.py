@@ -13,8 +13,6 @@ import pytest
 from benchmarks import sweep
 from benchmarks.bounds import least
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib import storage
-from benchmarks.lib.storage import Kept
 from benchmarks.loop.scenarios import around, random_design
 from benchmarks.sweep import main
 from tests.conftest import ROOT
@@ -42,10 +40,13 @@ def test_a_plant_that_does_not_settle_has_no_limit():
     assert limits == [pytest.approx(0.911, abs=0.001), pytest.approx(np.nan, nan_ok=True)]
 
 
-def run_sweep(out, options, status=0):
+def run_sweep(tmp_path, options, status=0):
+    """Run a sweep and return its runs, which stay apart if it has not finished."""
+    out = tmp_path / "out"
     given = f"--design random --plants 4 --runs 2 --jobs 1 {options} --out {out}"
     assert main(given.split()) == status
-    return pd.read_csv(out / "runs.csv")
+    folder = out.with_name("out.unfinished") if status else out
+    return pd.read_csv(folder / "runs.csv")
 
 
 class TestCommand:
@@ -60,23 +61,20 @@ class TestCommand:
         monkeypatch.setattr(sweep, "report", Mock())
         monkeypatch.setattr(least, "least_possible", lambda **_: Mock(value=1.0))
 
-    def test_random_design(self, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr(storage, "commit", lambda: "abc")
+    def test_random_design(self, tmp_path, capsys):
         given = "--design-seed 2026 --agents nn nn-frozen pi-simc"
         runs = run_sweep(tmp_path, given)
         golden = pd.read_csv(ROOT / "tests/golden/sweep.csv")
         pd.testing.assert_frame_equal(runs, golden, rtol=1e-8, atol=1e-8)
-        summary = pd.read_csv(tmp_path / "summary.csv")
+        out = tmp_path / "out"
+        summary = pd.read_csv(out / "summary.csv")
         assert list(summary["agent"]) == ["nn", "nn-frozen", "pi-simc"]
         for name in ("map.png", "report.html", "report.md"):
-            assert (tmp_path / name).stat().st_size > 1000
+            assert (out / name).stat().st_size > 1000
         assert "Does online learning help when the plant drifts?" in capsys.readouterr().out
-        assert json.loads((tmp_path / "provenance.json").read_text())["commit"] == "abc"
-        # Again: nothing is run, and nothing changes.
-        assert len(list(tmp_path.glob("tasks/**/*.pkl"))) == 4 * (3 + 1)
-        monkeypatch.setattr(Kept, "save", None)
-        monkeypatch.setattr(sweep, "report", Mock())
-        assert run_sweep(tmp_path, given).equals(runs)
+        command = json.loads((out / "provenance.json").read_text())["command"]
+        assert command.startswith("python -m benchmarks.sweep --design random --plants 4")
+        assert not (out / "tasks").exists()
 
     @pytest.mark.usefixtures("quick")
     def test_what_the_options_change(self, tmp_path):
@@ -90,7 +88,6 @@ class TestCommand:
 
     @pytest.mark.usefixtures("quick")
     def test_a_function_acts_in_each_plant_as_its_code_is_now(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(storage, "commit", lambda: "abc")
         monkeypatch.syspath_prepend(tmp_path)
         # Bytecode is told from an older one of the same second by its size alone.
         monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -100,27 +97,37 @@ class TestCommand:
             code = f"def law():\n    return lambda seen: {gain} * seen[:, 3:4]\n"
             (tmp_path / "own_law.py").write_text(code)
             importlib.invalidate_caches()
-            found.append(run_sweep(tmp_path / "out", "--agents pi --agent mine=own_law:law"))
+            found.append(run_sweep(tmp_path, "--agents pi --agent mine=own_law:law"))
         assert not found[0]["mae"].equals(found[1]["mae"])
 
     @pytest.mark.usefixtures("quick")
     @pytest.mark.parametrize(
         ("error", "status", "rows"), [(ArithmeticError, 1, 12), (KeyboardInterrupt, 130, 8)]
     )
-    def test_what_has_finished_is_written(self, error, status, rows, tmp_path, monkeypatch):
+    def test_what_has_finished_is_written_and_not_run_again(
+        self, error, status, rows, tmp_path, monkeypatch
+    ):
         run, begun = sweep.run_agent, []
 
         def fails(controller, *given):
             begun.append(controller)
-            if controller is ROSTER["pi"] and len(begun) > 6:  # from plant 2 on
+            if controller is ROSTER["pi"] and 6 < len(begun) <= 12:  # from plant 2 on
                 raise error
             return run(controller, *given)
 
         monkeypatch.setattr(sweep, "run_agent", fails)
-        monkeypatch.setattr(storage, "commit", lambda: "none-dirty")  # nothing is kept
-        counts = run_sweep(tmp_path, "--agents pi pi-simc", status)["agent"].value_counts()
+        stopped = run_sweep(tmp_path, "--agents pi pi-simc", status)
+        counts = stopped["agent"].value_counts()
         assert counts.sum() == rows
         assert counts["pi"] == 4
+        done = len(begun)
+        begun.extend([None] * (12 - done))  # from now on it works
+        runs = run_sweep(tmp_path, "--agents pi pi-simc")
+        assert runs["agent"].value_counts().to_dict() == {"pi": 8, "pi-simc": 8}
+        missing = {ArithmeticError: 2, KeyboardInterrupt: 5}[error]
+        assert len(begun) - 12 == missing
+        monkeypatch.setattr(sweep, "run_agent", run)
+        assert run_sweep(tmp_path, "--agents pi pi-simc").equals(runs)
 
 
 def test_differences_of_runs_made_up_so_that_the_answer_is_known():

@@ -163,9 +163,10 @@ def test_the_command_lists_trainings_by_their_seeds(
     assert program.main([*arguments, "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     assert {"10000", "10001"} <= set(shown.split())
-    assert {file.stem for file in tmp_path.glob("*.npz")} == files
+    folder = tmp_path / network
+    assert {file.stem for file in folder.glob("*.npz")} == files
     if network == "nn-smith":
-        best = LawNetwork.load(tmp_path / "nn-smith.npz").provenance["training"]["seed"]
+        best = LawNetwork.load(folder / "nn-smith.npz").provenance["training"]["seed"]
         assert f"Validation chooses seed {best}" in shown
 
 

@@ -1,5 +1,7 @@
 """The search for gains, on small budgets."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,17 +9,14 @@ import pytest
 from agents import DirectNNController
 from agents.pi import SEARCHED_GAINS
 from benchmarks import tune
-from benchmarks.compare import comparison
-from benchmarks.lib import storage
 from benchmarks.loop.scenarios import SCENARIOS
 from tests.conftest import ROOT
 
 
 class TestScore:
-    def test_cases_and_seeds_are_met_by_no_comparison(self):
+    def test_cases_are_met_by_no_comparison(self):
         compared = [case.arguments for case in SCENARIOS.values()]
         assert not any(arguments in compared for _, _, arguments in tune.CASES.values())
-        assert tune.FIRST_RUN < tune.FINAL_FIRST_RUN < comparison.SEED - 1_000_000
 
     def test_no_control_pays_for_not_settling(self):
         found = tune.score("pi", 2, 0, {"kp": 0.0, "ki": 0.0})
@@ -40,10 +39,11 @@ def short(monkeypatch):
 
 
 def search(out, runs=2, status=0):
-    """Run a search, and return its trials."""
+    """Run a search, and return its trials, which stay apart if it has not finished."""
     given = f"pi --trials 6 --runs {runs} --out {out}"
     assert tune.main(given.split()) == status
-    return pd.read_csv(out / "pi/trials.csv")
+    folder = out / "pi.unfinished" if status else out / "pi"
+    return pd.read_csv(folder / "trials.csv")
 
 
 @pytest.mark.usefixtures("short")
@@ -63,7 +63,6 @@ class TestSearch:
             assert np.isclose(trials["objective"], in_search, rtol=1e-3).any()
 
     def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch, capsys):
-        monkeypatch.setattr(storage, "commit", lambda: "abc")
         whole, judge, calls = search(tmp_path / "whole"), tune.settled, []
 
         def settled(runs):  # called once a trial
@@ -75,10 +74,27 @@ class TestSearch:
         monkeypatch.setattr(tune, "settled", settled)
         assert len(search(tmp_path / "halves", status=130)) == 4
         assert "Interrupted" in capsys.readouterr().out
+        assert not (tmp_path / "halves/pi").exists()
         assert search(tmp_path / "halves").equals(whole)
         assert len(calls) == 5 + 2 + 2  # the first four are kept; the last two are finalists
-        # Those of another search are not mixed with them.
-        assert not search(tmp_path / "halves", runs=1).equals(whole)
+
+    def test_one_that_is_stopped_before_its_first_trial_changes_nothing(
+        self, tmp_path, monkeypatch
+    ):
+        search(tmp_path)
+        before = {file.name: file.read_bytes() for file in (tmp_path / "pi").iterdir()}
+        monkeypatch.setattr(tune, "score", Mock(side_effect=KeyboardInterrupt))
+        assert tune.main(["pi", "--trials", "6", "--out", str(tmp_path)]) == 130
+        assert {file.name: file.read_bytes() for file in (tmp_path / "pi").iterdir()} == before
+        assert not (tmp_path / "pi.unfinished").exists()
+
+    def test_what_was_kept_of_another_search_is_not_used(self, tmp_path, monkeypatch):
+        score = tune.score
+        fails_at_third = Mock(side_effect=[*(score("pi", 2, 0, {}),) * 2, KeyboardInterrupt])
+        monkeypatch.setattr(tune, "score", fails_at_third)
+        search(tmp_path, runs=2, status=130)
+        monkeypatch.setattr(tune, "score", score)
+        assert search(tmp_path, runs=1).equals(search(tmp_path / "other", runs=1))
 
 
 def test_the_pages_of_the_searches_name_the_defaults():

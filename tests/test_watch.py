@@ -66,6 +66,16 @@ def test_a_film_shows_steps_side_by_side(given, plant, steps, written, tmp_path,
     assert f"PI (1992): error {found} times that of" in capsys.readouterr().out
 
 
+def test_a_film_stays_in_its_folder_whatever_the_name_of_the_controller(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "a/b").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "a/b")
+    assert main(["--agent", "../../$x=agents:PIController", "--scenario", "constant"]) == 0
+    (film,) = tmp_path.rglob("*.gif")
+    assert film == tmp_path / "a/b/results/watch/_______x-constant.gif"
+
+
 def test_a_plant_with_set_points_of_its_own_needs_no_scenario(monkeypatch, capsys):
     monkeypatch.setattr(watch, "write_film", lambda *_: "found")
     assert main(["--agent", "pi", "--set", "setpoint=random"]) == 0

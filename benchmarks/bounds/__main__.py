@@ -9,7 +9,9 @@ from functools import partial
 from typing import Any
 
 from benchmarks.lib.command import Count, FanOut, Runs, Seed, command, options
-from benchmarks.lib.storage import ROOT, commit, versions, write_json
+from benchmarks.lib.errors import NoBoundError
+from benchmarks.lib.provenance import ROOT, commit, versions
+from benchmarks.lib.storage import write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions, Scenario
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
@@ -88,7 +90,7 @@ def row(case: Scenario, samples: int, drawn: Mapping[str, Any], mpc: int | None)
     for kind in HEADINGS:
         cells.append("")
         # "causal" needs random set points, "reference" those that are held long enough.
-        with suppress(ValueError):
+        with suppress(NoBoundError):
             cells[-1] = f"{least(kind=kind):.4f}"
     if mpc:
         runs = ROSTER["mpc"].run(case.arguments, samples, mpc, drawn["seed"])

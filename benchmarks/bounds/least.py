@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.bounds.linear_program import SMOOTH, TAIL, plan, reference
 from benchmarks.bounds.unknown import unknown
+from benchmarks.lib.errors import NoBoundError
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import (
@@ -77,8 +78,8 @@ def least_possible(
         N, length of an episode.
     kind
         One of `KINDS`: "causal" is for random set points alone, "reference" for those that the
-        plant settles at before they change; a ValueError is raised otherwise. None chooses as
-        reports and `mptc_gym.evaluate` do: "causal" for random set points; otherwise
+        plant settles at before they change; otherwise a `NoBoundError` is raised. None chooses
+        as reports and `mptc_gym.evaluate` do: "causal" for random set points; otherwise
         "reference", or "preview" if there is none or if both are the same.
     episodes
         Number of episodes, if anything is drawn.
@@ -100,9 +101,9 @@ def least_possible(
         return of(kind or "causal")
     if kind is not None:
         allowed = f"{', '.join(kinds)} for the set point {parameters.setpoint!r}"
-        raise ValueError(f"kind must be one of {allowed}, got {kind!r}")
+        raise NoBoundError(f"kind must be one of {allowed}, got {kind!r}")
     preview = of("preview")
-    with suppress(ValueError):  # the plant does not settle between changes
+    with suppress(NoBoundError):  # the plant does not settle between changes
         unaware = of("reference")
         # Foresight makes no difference where nothing changes.
         return unaware if abs(unaware.value - preview.value) >= 1e-4 else preview

@@ -9,6 +9,7 @@ import numpy as np
 import scipy  # loads its modules on first use
 from numpy.typing import ArrayLike, NDArray
 
+from benchmarks.lib.errors import NoBoundError
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import held
 
@@ -184,7 +185,7 @@ def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> tuple[Ar
     reference holds under a condition. At each change the controller takes, from where it is,
     the flow that is best if the new set point stays. If the plant has settled by the next
     change, each change costs the least that is possible without preview; see `plan`. If it has
-    not settled, a ValueError is raised.
+    not settled, a `NoBoundError` is raised.
 
     The model covers `model.lag + TAIL` samples more than `setpoint`.
     """
@@ -198,7 +199,7 @@ def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> tuple[Ar
         error[start:stop] = of_hold[start:stop]
         moving = np.ptp(flow[max(stop - model.lag - 1, start - 1, 0) : stop])
         if not last and (stop - start < model.lag or moving > SETTLED * (high - low)):
-            raise ValueError(
+            raise NoBoundError(
                 "setpoint must be held until the plant has settled, or there is no reference; "
                 f"got a hold of {stop - start} samples"
             )

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.lib.command import FanOut, Folder, Names, Runs, command, known, options
-from benchmarks.lib.storage import origin, out_folder, write_csv
+from benchmarks.lib.provenance import origin
+from benchmarks.lib.results import results_folder
+from benchmarks.lib.storage import write_csv
 
 
 @options
@@ -32,19 +34,23 @@ def work(options: Options) -> str:
     from benchmarks.lib.report import write_report
 
     chosen = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
-    made, out = origin(), out_folder(options.out)
+    made = origin()
     # The last claims take longest, and start first.
     tasks = {name: partial(examined, name, Batch(options.runs)) for name in reversed(chosen)}
-    found: dict[str, Any] = {}
-    try:
-        found.update(options.fan_out.stream(tasks, "claims"))
-    finally:
-        if found:
-            numbers = table(CLAIMS, {name: found[name] for name in chosen if name in found})
-            write_csv(out / "claims.csv", numbers)
-            told = sections(CLAIMS, numbers)
-            write_report(out, "The paper's claims", told, "claims", made, printed=1)
-    return f"All numbers are in {out}/report.md and claims.csv"
+    findings: dict[str, Any] = {}
+    with results_folder(options.out) as folder:
+        try:
+            findings.update(options.fan_out.stream(tasks, "claims"))
+        finally:
+            if missing := len(tasks) - len(findings):
+                made["missing"] = f"{missing} of {len(tasks)} claims are missing"
+            if findings:
+                in_order = {name: findings[name] for name in chosen if name in findings}
+                numbers = table(CLAIMS, in_order)
+                write_csv(folder / "claims.csv", numbers)
+                parts = sections(CLAIMS, numbers)
+                write_report(folder, "The paper's claims", parts, made, printed=1)
+    return f"All numbers are in {options.out}/report.md and claims.csv"
 
 
 main = command("claims", Options, work)

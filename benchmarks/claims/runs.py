@@ -135,7 +135,8 @@ def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
         claim, measured = claims[str(name)], rows.dropna(subset="runs")
         title = f"{claim.statement}: {rows['verdict'].iloc[0]}"
         shown = _formatted(measured) if len(measured) else None
-        found.append(Section(title, [f"{claim.section}. {claim.method}"], shown))
+        text = f"{claim.section}. {claim.method}"
+        found.append(Section(title, [text], shown, bold=["no"]))
     return found
 
 
@@ -146,7 +147,7 @@ def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
         "value": value,
         "95 % interval": (low + " to " + high).where(rows["runs"] != 1, "exact"),
         "asked": rows["criterion"],
-        "shown": rows["shown"].replace("no", "**no**"),
+        "shown": rows["shown"],
     }
     return pd.DataFrame(columns)
 

@@ -8,9 +8,27 @@ from typing import Annotated, Any
 
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Folder, Names, Parameter, Runs, command, known, options
-from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
-from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, SETPOINTS, PlantOptions
+from benchmarks.lib.command import (
+    Folder,
+    Names,
+    Parameter,
+    Runs,
+    Seed,
+    command,
+    known,
+    options,
+)
+from benchmarks.lib.errors import UsageError
+from benchmarks.lib.provenance import origin
+from benchmarks.lib.results import results_folder
+from benchmarks.lib.storage import write_json
+from benchmarks.loop.scenarios import (
+    PRESET_SCENARIOS,
+    SCENARIOS,
+    SETPOINTS,
+    PlantOptions,
+    Scenario,
+)
 from mptc_gym.evaluation import SEED
 
 _CASES = (
@@ -19,7 +37,7 @@ _CASES = (
     f"{', '.join(name for name, *_ in SETPOINTS)}."
 )
 
-_OUT = "Folder (default: results/compare, -presets with these, -other with other options)."
+_OUT = "Folder (default: results/compare; compare-presets or compare-plant for other cases)."
 
 
 @options
@@ -35,6 +53,8 @@ class Options:
     """Run the environment's presets instead of the paper's cases."""
     runs: Runs = 100
     """Runs of each controller in each case."""
+    seed: Seed = SEED
+    """Seed of the first run (default: that of the published episodes)."""
     out: Annotated[Folder | None, Parameter(help=_OUT)] = None
 
 
@@ -44,44 +64,56 @@ def work(options: Options) -> str:
 
     controllers = chosen(options.agents, options.controllers.agent)
     fan_out = options.controllers.fan_out
-    there = options.plant.cases(PRESET_SCENARIOS if options.presets else SCENARIOS)
-    if options.presets and options.plant.name:
-        raise UsageError("--presets cannot be combined with --plant, --preset and --set")
-    names = [*there] if options.scenarios is None else options.scenarios
-    scenarios = [there[name] for name in known("--scenarios", names, there)]
-    if not scenarios:
-        raise UsageError("--scenarios: none to run")
-    place = "compare-presets" if options.presets else "compare"
-    if options != Options(
-        presets=options.presets, controllers=ControllerOptions(fan_out=fan_out)
-    ):
-        place = "compare-other"
-    folder, made = out_folder(options.out or Path("results", place)), origin()
-    runs = options.runs
-    bounds = {f"bounds of {each.name}": partial(scale_of, each, runs) for each in scenarios}
+    name_of_cases, scenarios = cases(options)
+    target, made = options.out or Path("results", name_of_cases), origin()
+    runs, seed = options.runs, options.seed
+    bounds = {
+        f"bounds of {scenario.name}": partial(scale_of, scenario, runs, seed)
+        for scenario in scenarios
+    }
     cells = {
-        f"{name}, {each.name}": partial(run_case, each, controller, runs)
-        for (name, controller), each in itertools.product(controllers.items(), scenarios)
+        f"{name}, {scenario.name}": partial(run_case, scenario, controller, runs, seed)
+        for (name, controller), scenario in itertools.product(controllers.items(), scenarios)
     }
     # Short tasks last, so that no core waits long at the end.
-    tasks = dict(sorted((bounds | cells).items(), key=lambda each: -each[1].args[0].samples))
+    tasks = dict(sorted((bounds | cells).items(), key=lambda task: -task[1].args[0].samples))
     found: dict[str, Any] = {}
-    try:
-        found.update(fan_out.stream(tasks, "compare"))
-    finally:
-        if missing := len(tasks) - len(found):
-            made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
-        if finished := [found[name] for name in cells if name in found]:
-            about = made | {
-                "options": {**asdict(options), "agents": [*controllers]},
-                "seeds": [*range(SEED, SEED + runs)],
-                "scenarios": {each.name: vars(each) for each in scenarios},
-                "policies": {each.agent: each.policies for each in finished if each.policies},
-            }
-            write_json(folder / "provenance.json", about)
-            scales = [found[name] for name in bounds if name in found]
-            write(finished, scales, controllers, folder, made)
-    return f"The report, tables, data and plots are in {folder}/"
+    with results_folder(target) as folder:
+        try:
+            found.update(fan_out.stream(tasks, "compare"))
+        finally:
+            if missing := len(tasks) - len(found):
+                made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
+            if finished := [found[name] for name in cells if name in found]:
+                provenance = made | {
+                    "options": {**asdict(options), "agents": [*controllers]},
+                    "seeds": [*range(seed, seed + runs)],
+                    "scenarios": {scenario.name: vars(scenario) for scenario in scenarios},
+                    "policies": {
+                        case.agent: case.policies for case in finished if case.policies
+                    },
+                }
+                write_json(folder / "provenance.json", provenance)
+                scales = [found[name] for name in bounds if name in found]
+                write(finished, scales, controllers, folder, made)
+    return f"The report, tables, data and plots are in {target}/"
+
+
+def cases(options: Options) -> tuple[str, list[Scenario]]:
+    """Return the name of the cases that the options ask for, a folder's, and these cases."""
+    if options.presets and options.plant.name:
+        raise UsageError("--presets cannot be combined with --plant, --preset and --set")
+    if options.presets:
+        name, available = "compare-presets", PRESET_SCENARIOS
+    elif options.plant.name:
+        name, available = "compare-plant", dict(options.plant.cases(SCENARIOS))
+    else:
+        name, available = "compare", SCENARIOS
+    wanted = [*available] if options.scenarios is None else options.scenarios
+    scenarios = [available[wish] for wish in known("--scenarios", wanted, available)]
+    if not scenarios:
+        raise UsageError("--scenarios: none to run")
+    return name, scenarios
 
 
 main = command("compare", Options, work)

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from benchmarks.lib.statistics import Estimate, bootstrap, percentiles, written
 from benchmarks.lib.storage import write_csv
 from benchmarks.loop.rollout import CHANGE, START, Trajectory, is_random, measure
 from benchmarks.loop.scenarios import Scenario
-from mptc_gym.evaluation import EPISODES, SEED
+from mptc_gym.evaluation import EPISODES
 
 BOOTSTRAP = 0  # seed of the bootstraps
 SCORE = "Mean over the cases, 95 % interval; travel of the valve in the median run."
@@ -45,21 +46,21 @@ class Case:
     seconds: float  # processor time of the runs
 
 
-def run_case(scenario: Scenario, controller: Controller, runs: int) -> Case:
-    """Run all members of a controller on a case.
+def run_case(scenario: Scenario, controller: Controller, runs: int, seed: int) -> Case:
+    """Run all members of a controller on a case; run i has the seed `seed + i`.
 
     Where nothing is drawn, all runs are alike: then there is one, and its row is repeated.
     """
     began = time.process_time()
     members = controller.members()
     alike = not (controller.random or is_random(scenario.parameters))
-    case = scenario.arguments, scenario.samples, 1 if alike else runs, SEED
+    case = scenario.arguments, scenario.samples, 1 if alike else runs, seed
     trajectories, tables = [member.run(*case) for member in members], []
     for number, trajectory in enumerate(trajectories):
         about = {"scenario": scenario.name, "agent": controller.name, "policy": number}
         measures = measure(trajectory, scenario.parameters)
         rows = {name: np.broadcast_to(values, runs) for name, values in measures.items()}
-        tables.append(pd.DataFrame({**about, "seed": range(SEED, SEED + runs), **rows}))
+        tables.append(pd.DataFrame({**about, "seed": range(seed, seed + runs), **rows}))
     return Case(
         scenario.name,
         controller.name,
@@ -97,14 +98,16 @@ class Scale:
     preview: float  # the least possible error of any controller, even with foresight, degC
 
 
-def scale_of(scenario: Scenario, runs: int) -> Scale:
+def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     """Return the bounds on the errors of a case: means over the episodes that are run."""
     from benchmarks.bounds.least import least_possible  # here: SciPy is slow to import
 
-    episodes: dict[str, Any] = {"samples": scenario.samples, "episodes": min(runs, EPISODES)}
-    least = least_possible(**episodes, **scenario.arguments)
+    of_episodes = partial(
+        least_possible, samples=scenario.samples, episodes=min(runs, EPISODES), seed=seed
+    )
+    least = of_episodes(**scenario.arguments)
     least.score(0.0)  # raises an error if nothing is better than no control
-    preview = least_possible(kind="preview", **episodes, **scenario.arguments)
+    preview = of_episodes(kind="preview", **scenario.arguments)
     return Scale(scenario, least, preview.value)
 
 
@@ -184,9 +187,6 @@ def write(
     }
     for name, table in {"runs": runs, "summary": summarise(runs), **responses}.items():
         write_numbers(folder / f"{name}.csv", table)
-    pictures = [f"{name}.png" for name in ("scores", "travel", *responses)]
-    for name in ("estimates.csv", "report.md", "report.html", *pictures):  # of an earlier run
-        (folder / name).unlink(missing_ok=True)
     scales = {each.scenario.name: each for each in found if each.scenario.name in responses}
     runs = runs[runs["scenario"].isin([*scales])]
     if runs.empty:
@@ -205,7 +205,7 @@ def write(
         rows, path = responses[name] if few.empty else few, folder / f"{name}.png"
         plots.plot_responses(rows, errors[name], scale.scenario, path)
     sections = report(runs, estimates, scores, scales, cases, controllers)
-    write_report(folder, "Comparison of controllers", sections, "compare", made, printed=2)
+    write_report(folder, "Comparison of controllers", sections, made, printed=2)
 
 
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
@@ -257,7 +257,7 @@ def report(
         ),
         Section(f"Difference to {label(reference)} (°C), 95 % interval", [PAIRED], paired),
         Section(
-            "Where the error arises: `hard`",
+            "Where the error arises: hard",
             ["Contributions to the mean error, °C: means of all runs."],
             parts.rename_axis("controller").reset_index(),
         ),

@@ -17,7 +17,7 @@ from agents.controller import PAPER_WINDOWS
 from agents.networks import WINDOWS
 from benchmarks.controllers.roster import EVERYTHING, LIMITS, OWN, ROSTER, Controller
 from benchmarks.lib.command import FanOut, Names, Parameter, blame, options
-from benchmarks.lib.storage import UsageError
+from benchmarks.lib.errors import UsageError
 from mptc_gym import IDS, Parameters
 from mptc_gym.acting import check_fit, natives, opened, start
 from mptc_gym.evaluation import case_of

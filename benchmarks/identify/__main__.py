@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 from benchmarks.lib.command import Finite, Folder, command, options
-from benchmarks.lib.storage import UsageError, origin, out_folder, write_json
+from benchmarks.lib.errors import UsageError
+from benchmarks.lib.provenance import origin
+from benchmarks.lib.storage import out_folder, write_json
 
 # NumPy reads it when it is imported. Threads for small matrices only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -65,7 +67,7 @@ def work(options: Options) -> str:
     for name, content in {"plant": plant, "ranges": ranges, "controllers": advised}.items():
         write_json(out / f"{name}.json", content)
     sections = report.report(found, advised)
-    write_report(out, f"The plant of {options.log.name}", sections, "identify", made)
+    write_report(out, f"The plant of {options.log.name}", sections, made)
     return f"The plant and the report are in {out}/"
 
 

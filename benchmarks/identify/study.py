@@ -17,7 +17,8 @@ from benchmarks.identify.__main__ import Options
 from benchmarks.identify.advice import controllers
 from benchmarks.identify.log import Log
 from benchmarks.identify.model import identify
-from benchmarks.lib.storage import ROOT, write_text
+from benchmarks.lib.provenance import ROOT
+from benchmarks.lib.storage import write_text
 
 FINE = 5  # steps of the simulator in a sample
 # Where a valve of size a goes from p when it is told u; t is the log's progress from -1 to 1.

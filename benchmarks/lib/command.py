@@ -7,26 +7,28 @@ finds, returns the closing line, and imports what is slow to import. The last li
 """
 
 import errno
-import importlib
 import inspect
 import math
 import os
+import shlex
 import signal
 import sys
 import threading
+import time
 import traceback
-import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
-from benchmarks.lib.storage import ROOT, Kept, UnfinishedError, UsageError
+from benchmarks.lib.errors import UnfinishedError, UsageError
+from benchmarks.lib.provenance import COMMAND_LINE, ROOT
+from benchmarks.lib.results import KeptResults
 
 EXTRAS = {
-    "compare": "cyclopts joblib markdown matplotlib pandas rich scipy tabulate",
+    "compare": "cyclopts filelock joblib markdown matplotlib pandas rich scipy tabulate",
     "data": "h5py minari",
     "bench": "optuna PIL stable_baselines3",
     "ray": "ray",
@@ -144,9 +146,8 @@ def command(
     program = f"python -m benchmarks.{name}"
 
     def main(arguments: Sequence[str] | None = None) -> int:
-        if work.__module__ == "__main__" and (spec := sys.modules["__main__"].__spec__):
-            # Other processes find tasks by the name of a module to be imported.
-            return int(importlib.import_module(spec.name).main())
+        given = sys.argv[1:] if arguments is None else arguments
+        typed = COMMAND_LINE.set(shlex.join(["python", "-m", f"benchmarks.{name}", *given]))
         os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever the shell has set
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
@@ -155,15 +156,17 @@ def command(
             if arguments is None and signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, _interrupt)
 
-        def whole() -> str:
-            given = sys.argv[1:] if arguments is None else arguments
+        def read_and_work() -> str:
             chosen = read(declared, program, given)
-            said = "" if chosen is None else work(chosen)
+            closing_line = "" if chosen is None else work(chosen)
             if arguments is None:  # the process ends: nothing is left to be interrupted
                 _ignore_signals()
-            return said
+            return closing_line
 
-        return finish(whole, program)
+        try:
+            return finish(read_and_work, program)
+        finally:
+            COMMAND_LINE.reset(typed)
 
     return main
 
@@ -179,7 +182,7 @@ def finish(work: Callable[[], str], program: str) -> int:
         if said := work():
             print(said, flush=True)
     except KeyboardInterrupt as stopped:
-        print("\nInterrupted: what has finished is written.", flush=True)
+        print("\nInterrupted.", flush=True)
         return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
     except (UnfinishedError, MemoryError) as error:
         print(str(error) or "There is not enough memory for so many runs or samples.")
@@ -204,8 +207,6 @@ def _ignore_signals() -> None:
 def _interrupt(number: int, _frame: object) -> NoReturn:
     """Raise KeyboardInterrupt; later signals are ignored while what has finished is written."""
     _ignore_signals()
-    threading.excepthook = lambda _: None  # of joblib's threads, as its processes end
-    warnings.simplefilter("ignore")
     raise KeyboardInterrupt(number)
 
 
@@ -227,7 +228,7 @@ class FanOut:
     """Where tasks run: loky for this machine, ray for the Ray cluster at RAY_ADDRESS."""
 
     def stream(
-        self, tasks: Mapping[str, Task], title: str = "", kept: Kept | None = None
+        self, tasks: Mapping[str, Task], title: str = "", kept: KeptResults | None = None
     ) -> Iterator[tuple[str, Any]]:
         """Run tasks, and yield the name and result of each as it finishes; on Ray, at the end.
 
@@ -237,8 +238,9 @@ class FanOut:
         """
         missing, errors = dict(tasks), {}
         with progress_bar(title, len(tasks)) as advance:
-            for name, task in tasks.items():
-                if kept and (result := kept.load(task)) is not None:
+            for name in tasks:
+                result = kept.load(name) if kept else None
+                if result is not None:
                     del missing[name]
                     advance()
                     yield name, result
@@ -248,7 +250,7 @@ class FanOut:
                     errors[name] = error
                     continue
                 if kept:
-                    kept.save(tasks[name], result)
+                    kept.save(name, result)
                 yield name, result
         if errors:
             said = f"{len(errors)} of {len(tasks)} tasks failed; the others are done"
@@ -262,22 +264,20 @@ class FanOut:
         import joblib  # here: slow to import
         from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-        calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
         if self.backend == "ray":
             _connect()
+            calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
             with joblib.parallel_config("ray", n_jobs=self.jobs or -1):
                 yield from joblib.Parallel()(calls)
             return
+        process = os.getpid()
+        calls = [joblib.delayed(_attempt)(name, task, process) for name, task in tasks.items()]
         jobs = max(1, min(self.jobs or joblib.cpu_count(), len(calls)))
         try:
             with joblib.parallel_config("loky", inner_max_num_threads=1):
                 parallel = joblib.Parallel(jobs, return_as="generator_unordered", batch_size=1)
-                # Processes that start now ignore Ctrl-C: this one ends them.
-                before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-                answers: Iterator[Answer] = parallel(calls)
-                signal.signal(signal.SIGINT, before)
-            # Of tasks that nobody waits for any more, as an error ends the command.
-            warnings.filterwarnings("ignore", module="joblib")
+                with _processes_that_ignore(signal.SIGINT):
+                    answers: Iterator[Answer] = parallel(calls)
             yield from answers
         except TerminatedWorkerError as error:
             raise UnfinishedError(
@@ -285,14 +285,50 @@ class FanOut:
             ) from error
 
 
-def _attempt(name: str, task: Task) -> Answer:
-    """Run a task, and return its error as text, since not every exception can be pickled."""
+@contextmanager
+def _processes_that_ignore(number: int) -> Iterator[None]:
+    """Start processes that ignore a signal, such as Ctrl-C, on which this process ends them.
+
+    Only the main thread can ask for that. Those of another thread ignore it from their first
+    task on.
+    """
+    before = signal.getsignal(number)
+    if threading.current_thread() is not threading.main_thread() or before is None:
+        yield
+        return
+    signal.signal(number, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+def _attempt(name: str, task: Task, parent: int = 0) -> Answer:
+    """Run a task, and return its error as text, since not every exception can be pickled.
+
+    `parent` is the process that started the one of this task; 0 on a cluster.
+    """
+    if parent not in (0, os.getpid()):
+        _prepare_process(parent)
     try:
         return name, task(), ""
     except UsageError as error:  # a sentence, of a user's own controller
         return name, None, str(error)
     except (Exception, SystemExit):
         return name, None, traceback.format_exc().strip()
+
+
+@cache
+def _prepare_process(parent: int) -> None:
+    """Make this process ignore Ctrl-C, and end when the process that started it is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def end_with_parent() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 @contextmanager

@@ -9,11 +9,9 @@ import base64
 import html
 import math
 import re
-import shlex
 import shutil
-import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,11 +40,12 @@ img { max-width: 100%; }
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a report."""
+    """A section of a report. Its texts are plain: nothing in them is read as Markdown."""
 
     title: str  # "" for none
     text: Sequence[str] = ()  # paragraphs
     table: pd.DataFrame | None = None  # of text
+    bold: Collection[str] = ()  # cells that are shown in bold type
     # PNG files in the report's folder, and for each what it shows, in a sentence.
     pictures: Mapping[str, str] = field(default_factory=dict)
 
@@ -55,45 +54,89 @@ def write_report(
     folder: Path,
     title: str,
     sections: Sequence[Section],
-    command: str,
     origin: Mapping[str, Any],
     printed: int | None = None,
 ) -> None:
     """Write `report.md` and `report.html`, and print the first `printed` sections, or all.
 
-    The last line is the origin and the command of `benchmarks`, the first one what is missing.
+    The first line says what is missing, if `origin` has the key "missing"; the last line is the
+    time, the commit and the command line.
     """
-    import markdown
-
-    called = sys.argv[1:] if command in sys.argv[0] else []
-    line = shlex.join(["python", "-m", f"benchmarks.{command}", *called])
-    commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty"
-    unfinished = [f"**Unfinished: {origin['missing']}.**"] if "missing" in origin else []
-    parts = [f"# {title}", *unfinished]
-    for section in sections:
-        parts += [f"## {section.title}"] * bool(section.title) + [*section.text]
-        if section.table is not None:
-            parts.append(section.table.to_markdown(index=False, disable_numparse=True))
-        there = [name for name in section.pictures if (folder / name).exists()]
-        parts += [f"![{section.pictures[name]}]({name})" for name in there]
-    made = f"{origin['started']}, commit {commit[:12]}{commit[40:]}: {line}\n"
-    page = "\n\n".join([*parts, made])
+    unfinished = f"Unfinished: {origin['missing']}." if "missing" in origin else ""
+    page = _page(folder, title, sections, origin, unfinished)
     write_text(folder / "report.md", page)
-    body = markdown.markdown(page, extensions=["tables", "toc"])
-    head = f"{_HEAD}<title>{html.escape(title)}</title>"
-    for name in re.findall(r'src="([\w.-]+\.png)"', body):
-        data = base64.b64encode((folder / name).read_bytes()).decode()
-        body = body.replace(f'src="{name}"', f'src="data:image/png;base64,{data}"')
-    page = f"{head}\n{body}\n</html>\n"
-    write_text(folder / "report.html", page)
+    write_text(folder / "report.html", _html(folder, title, page))
+    if unfinished:
+        print(unfinished)
     width = shutil.get_terminal_size((150, 24)).columns
-    for text in unfinished:
-        print(text)
     for section in sections[:printed]:
         for text in filter(None, [section.title, *section.text]):
             print(textwrap.fill(text, width))
         if section.table is not None:
             print(on_screen(section.table))
+
+
+def escape(text: object) -> str:
+    """Return Markdown, on one line, that shows a text as it is.
+
+    A text may come from outside: the name of a controller, of a file or of a column. Without
+    this it could end a cell of a table, or bring tags and links into the page.
+    """
+    escaped = " ".join(str(text).split()).replace("\\", "\\\\")
+    escaped = escaped.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    escaped = escaped.replace("|", "\\|").replace("](", "]\\(")
+    for pair in "*_`":  # which have a meaning if they enclose something
+        if escaped.count(pair) > 1:
+            escaped = escaped.replace(pair, f"\\{pair}")
+    return escaped
+
+
+def _page(
+    folder: Path,
+    title: str,
+    sections: Sequence[Section],
+    origin: Mapping[str, Any],
+    unfinished: str,
+) -> str:
+    """Return a report in Markdown, with the pictures that are in the folder."""
+    parts = [f"# {escape(title)}"]
+    if unfinished:
+        parts.append(f"**{escape(unfinished)}**")
+    for section in sections:
+        if section.title:
+            parts.append(f"## {escape(section.title)}")
+        parts += map(escape, section.text)
+        if section.table is not None:
+            parts.append(_table(section.table, section.bold))
+        for name, caption in section.pictures.items():
+            if (folder / name).exists():
+                parts.append(f"![{escape(caption)}]({name})")
+    commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty", or ""
+    version = f"commit {commit[:12]}{commit[40:]}" if commit else f"code {origin['code'][:12]}"
+    command = origin["command"] or "called from Python"
+    parts.append(f"{origin['started']}, {version}: {escape(command)}\n")
+    return "\n\n".join(parts)
+
+
+def _table(table: pd.DataFrame, bold: Collection[str]) -> str:
+    """Return a table of text in Markdown."""
+
+    def cell(text: object) -> str:
+        return f"**{escape(text)}**" if text in bold else escape(text)
+
+    shown = table.astype(object).map(cell).rename(columns=escape)
+    return str(shown.to_markdown(index=False, disable_numparse=True))
+
+
+def _html(folder: Path, title: str, page: str) -> str:
+    """Return a page of Markdown as one file of HTML, with the pictures in it."""
+    import markdown
+
+    body = markdown.markdown(page, extensions=["tables", "toc"])
+    for name in re.findall(r'src="([\w.-]+\.png)"', body):
+        data = base64.b64encode((folder / name).read_bytes()).decode()
+        body = body.replace(f'src="{name}"', f'src="data:image/png;base64,{data}"')
+    return f"{_HEAD}<title>{html.escape(title)}</title>\n{body}\n</html>\n"
 
 
 def on_screen(table: pd.DataFrame) -> str:
@@ -119,6 +162,7 @@ STYLE: Any = {
     "figure.dpi": 130,
     "font.size": 9,
     "grid.alpha": 0.3,
+    "text.parse_math": False,  # names of controllers may have a dollar
 }
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from benchmarks.lib.command import Parameter, options
-from benchmarks.lib.storage import UsageError
+from benchmarks.lib.errors import UsageError
 from benchmarks.loop.linear import nominal
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.parameters import slowest_pole

@@ -21,12 +21,14 @@ from torch import nn
 
 from agents import Increments, PolicyNetwork
 from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
-from benchmarks.lib.storage import versions
+from benchmarks.lib.provenance import versions
 from mptc_gym import PRESETS, evaluate
 from mptc_gym.sb3 import GymnasiumVecEnv
 from mptc_gym.wrappers.vector import IncrementalAction
 
 Array = NDArray[np.float64]
+
+load = PolicyNetwork.load
 
 TRAINING_SEEDS = 1 << 32  # seeds from here on are those of the training plants alone
 VALIDATION_SEED = 9_000_000  # no published result uses the seeds from here on

@@ -17,9 +17,10 @@ import torch
 from torch import Tensor, nn
 
 from agents.neural_law import INPUTS, MOST_ADDED, OUTPUTS, LawNetwork
-from benchmarks.lib.storage import versions
+from benchmarks.lib.provenance import versions
 from benchmarks.train.loops import Draw, Loops, environment
 
+load = LawNetwork.load
 VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED = 64, 600, 3_000_000
 # Kinds of validation plants, with the ranges drawn from: low, high, and the power of `small`.
 # They do not occur in training, and their models are exact.
