@@ -47,6 +47,7 @@ MAKERS = {
     for name, needed in NEEDS.items()
     if needed <= set(TOLD)
 }
+INTERNAL_MODELS = (SmithPredictor,)
 WINDOWS = {"setpoint_window": 1, "output_window": 2, "action_window": 2}
 
 
@@ -297,17 +298,31 @@ def test_simc_by_hand():
         (2.0, {"dead_zone": 5.0, "u_min": -3.0}),  # the limit lies inside the dead zone
     ],
 )
-@pytest.mark.parametrize("delay", [0, 18])
-def test_with_the_right_model_there_is_no_delay_to_the_loop(setpoint, actuator, delay):
+def test_with_the_right_model_there_is_no_delay_to_the_loop(setpoint, actuator):
     # On a plant that is its model, the output is that of the loop without delay, later.
     pole = np.exp(-8 / 161)
     plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), **actuator}
     plant["setpoint"] = setpoint
-    smith = SmithPredictor(**{**TOLD, "delay": 8.0 * (delay + 1), **actuator})
-    late = rollout(make_plants(1, 200, **plant, delay=delay), smith, 200, seed=0)
-    prompt = PIController(smith.kp, smith.ki, anti_windup=True, u_min=smith.u_min)
-    soon = rollout(make_plants(1, 200, **plant, delay=0), prompt, 200, seed=0)
-    np.testing.assert_allclose(late.output[delay:], soon.output[: 200 - delay], atol=1e-4)
+    outputs = []
+    for delay in (0, 18):
+        smith = SmithPredictor(**{**TOLD, "delay": 8.0 * (delay + 1), **actuator})
+        trajectory = rollout(make_plants(1, 200, **plant, delay=delay), smith, 200, seed=0)
+        outputs.append(trajectory.output[delay : 182 + delay])
+    np.testing.assert_allclose(*outputs, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", INTERNAL_MODELS)
+def test_nothing_winds_up_at_a_limit_or_sticks_in_the_dead_zone(kind):
+    controller = kind(**TOLD, dead_zone=5.0)
+    # 9 degC are out of reach; 6 degC take 8.8 t/h. The valve must leave its limit at once.
+    plants = make_plants(1, 320, setpoint=[9.0] * 300 + [6.0])
+    applied = rollout(plants, controller, 320, seed=0).applied
+    assert (applied[290:300] == -10.0).all()
+    assert applied[300] > -10.0
+    # 1 degC takes 1.5 t/h, inside the zone: now and then 5 t/h pass, and never more.
+    held = rollout(make_plants(1, 900, setpoint=1.0), controller, 900, seed=0)
+    assert set(np.abs(held.applied[100:]).ravel()) == {0.0, 5.0}
+    assert np.abs(held.next_error[300:]).max() < 0.5
 
 
 def test_a_command_on_the_edge_of_the_dead_zone_has_an_effect():
