@@ -1,6 +1,7 @@
 """Provide controllers for the middle-point temperature, independent of the environment."""
 
 from agents.controller import Controller
+from agents.dahlin import DahlinController
 from agents.direct_nn import DirectNNController, Weights
 from agents.networks import Increments, PolicyNetwork
 from agents.neural_law import LawNetwork, NeuralSmithPredictor
@@ -11,6 +12,7 @@ from agents.smith import SmithPredictor
 
 __all__ = [
     "Controller",
+    "DahlinController",
     "DirectNNController",
     "Increments",
     "LawNetwork",

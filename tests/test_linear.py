@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from agents import PIController, SmithPredictor
+from agents import DahlinController, PIController, SmithPredictor
 from benchmarks.lib.storage import UsageError
 from benchmarks.loop.linear import nominal, step_test
 from benchmarks.loop.scenarios import PlantOptions
@@ -89,7 +89,14 @@ def test_bad_plant_file_is_named(tmp_path):
 
 @pytest.mark.parametrize(
     "controller",
-    [PIController(0.5, 0.01), SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0)],
+    [
+        PIController(0.5, 0.01),
+        SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0),
+        DahlinController(**STEP_TEST, closed_loop_time_constant=80.0),
+        DahlinController(
+            **STEP_TEST, closed_loop_time_constant=80.0, filter_time_constant=50.0
+        ),
+    ],
 )
 def test_transfer_function_is_what_the_controller_does(controller):
     # Away from limits and dead zone, commands are the error, filtered.
