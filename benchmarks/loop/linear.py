@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 LEVELS = 0.283, 0.632  # of a step response, which time constant and delay are read off
 SLOWEST = 1 - 1e-5  # pole of a plant that settles soon enough for a step test
-FREQUENCIES = np.geomspace(1e-4, math.pi, 600)  # of the sensitivity, rad per sample
+FREQUENCIES = np.geomspace(1e-4, math.pi, 400)  # of the sensitivity, rad per sample
 CIRCLE = 1 << 14  # points on the unit circle at which unstable poles are counted
 LONGEST_DELAY = 1000  # samples; the longest for which the stability of a loop is examined
 
@@ -238,7 +238,7 @@ def time_constant_for(
     def fits(time_constant: float) -> bool:
         return LinearLoop.of(make(time_constant), plant).sensitivity() <= target
 
-    grid: list[float] = np.geomspace(slowest, fastest, 40).tolist()
+    grid: list[float] = np.geomspace(slowest, fastest, 24).tolist()
     first = next((i for i, each in enumerate(grid) if not fits(each)), None)
     if first is None:
         return fastest
@@ -247,7 +247,7 @@ def time_constant_for(
             f"no time constant up to {slowest:g} s gives the loop an Ms of {target:g} or less"
         )
     fast, slow = grid[first], grid[first - 1]
-    while slow / fast > 1.0 + 1e-6:
+    while slow / fast > 1.0 + 1e-5:
         middle = math.sqrt(slow * fast)
         if fits(middle):
             slow = middle
