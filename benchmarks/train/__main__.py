@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 from benchmarks.lib.command import Count, FanOut, Folder, Parameter, command, options
-from benchmarks.lib.storage import Kept, out_folder, replacing
+from benchmarks.lib.storage import Kept, UsageError, out_folder, replacing
+from benchmarks.loop.scenarios import PlantOptions
 
 SEED = 10_000  # of the first network; the others follow
 # Modules with the recipes, and how many networks are trained by default.
@@ -28,6 +29,7 @@ class Options:
     networks: Count | None = None
     """Networks to train, each from its own seed (default: 1 for nn-smith, where validation
     chooses the best; 5 for PPO, which are all compared)."""
+    plant: PlantOptions = field(default_factory=PlantOptions)
     steps: Count | None = None
     """Optimiser steps or, for PPO, samples of experience (default: as published)."""
     out: Folder = Path("results/networks")
@@ -46,7 +48,14 @@ def work(options: Options) -> str:
     recipe = module.RECIPES[name]
     recipe = replace(recipe, steps=options.steps or recipe.steps)
     seeds = range(SEED, SEED + (options.networks or usual))
-    tasks = {f"seed {seed}": partial(module.train, recipe, seed) for seed in seeds}
+    train, stem = module.train, name
+    if options.plant.name:
+        if name != "ppo":
+            raise UsageError(f"--plant, --preset and --set are for ppo, not for {name}")
+        plant = options.plant.arguments()
+        recipe = replace(module.for_plant(plant), steps=recipe.steps)
+        train, stem = partial(module.train, plant=plant), f"{name}-plant"
+    tasks = {f"seed {seed}": partial(train, recipe, seed) for seed in seeds}
     trained = dict(options.fan_out.stream(tasks, "training", Kept(out / "tasks")))
     networks = {seed: trained[f"seed {seed}"] for seed in seeds}
     about = {seed: network.provenance for seed, network in networks.items()}
@@ -56,13 +65,13 @@ def work(options: Options) -> str:
     }
     shown = pd.DataFrame.from_dict(rows, "index").map("{:.4g}".format)
     print(on_screen(shown.reset_index(names="seed")))
-    files = {f"{name}-{seed}": network for seed, network in networks.items()}
+    files = {f"{stem}-{seed}": network for seed, network in networks.items()}
     if name == "nn-smith":
         best = min(rows, key=lambda seed: rows[seed]["all"])
         files = {name: networks[best]}
         print(f"Validation chooses seed {best}")
-    for stem, network in files.items():
-        with replacing(out / f"{stem}.npz") as file:
+    for file_name, network in files.items():
+        with replacing(out / f"{file_name}.npz") as file:
             network.save(file)
     return f"Written to {out}: {', '.join(files)}"
 
