@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
-from benchmarks.controllers.roster import ROSTER, Controller, label
+from benchmarks.controllers.roster import ROSTER, label
+from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.command import Folder, Parameter, Runs, Seed, blame, command, options
 from benchmarks.lib.errors import NoBoundError, UsageError
 from benchmarks.lib.provenance import origin
@@ -60,9 +61,9 @@ QUESTIONS = {  # about pairs of controllers: does the first make the smaller err
         ("nn-frozen", "pi-simc"),
     ),
     "What does adaptation buy?": (
-        ("nn-self-tuning", "nn-smith"),
-        ("nn-self-tuning", "self-tuning"),
-        ("nn-smith", "smith"),
+        ("neural-self-tuning", "neural-smith"),
+        ("neural-self-tuning", "self-tuning"),
+        ("neural-smith", "smith"),
         ("self-tuning", "smith"),
     ),
 }
@@ -147,7 +148,7 @@ def design(options: Options, nominal: Arguments) -> list[Arguments]:
 
 
 def run_agent(
-    controller: Controller, told: Arguments, case: Arguments, runs: int
+    controller: ControllerSpec, told: Arguments, case: Arguments, runs: int
 ) -> dict[str, Any]:
     """Run a controller that is made for the plant it is `told` on another one; measure it."""
     agent = controller.in_service(told, runs, SEED)
@@ -160,7 +161,7 @@ def scale_of(case: Arguments, runs: int) -> dict[str, Any]:
     """Run no control on a plant; add the reference (`limit`), NaN if there is none."""
     from benchmarks.bounds.least import least_possible
 
-    found = {**run_agent(ROSTER["nothing"], case, case, runs), "limit": math.nan}
+    found = {**run_agent(ROSTER["idle"], case, case, runs), "limit": math.nan}
     with suppress(NoBoundError):  # the plant does not settle
         found["limit"] = least_possible(samples=SAMPLES, kind="reference", **case).value
     return found

@@ -1,19 +1,32 @@
 """Search for a controller's gains with Optuna: `python -m benchmarks.tune --help`."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.controllers.plant_scale import scales
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Folder, Parameter, Runs, command, options, progress_bar
+from benchmarks.controllers.spec import ControllerSpec
+from benchmarks.lib.command import (
+    Folder,
+    Parameter,
+    Runs,
+    blame,
+    command,
+    options,
+    progress_bar,
+)
 from benchmarks.lib.provenance import origin
 from benchmarks.lib.results import KeptResults, conditions_of, results_folder
-from benchmarks.lib.storage import write_csv
+from benchmarks.lib.storage import write_csv, write_json
 from benchmarks.loop.rollout import mean_error, settled
+from benchmarks.loop.scenarios import Arguments, PlantOptions
+from mptc_gym import Parameters
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,34 +37,53 @@ FIRST_RUN = 3_000_000  # first seed of the runs; no comparison uses these seeds
 FINALISTS = 10  # of the best trials, which are judged again
 FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for that
 PENALTY = 5.0  # degC, for failing to settle: the cost of doing nothing about an error of 5 degC
-TUNED = {name: each.gains for name, each in ROSTER.items() if each.gains}
+TUNED = [name for name, spec in ROSTER.items() if spec.spans]
 NOTE = (
     "For each case, the median over runs of the mean absolute error, °C. The objective is "
     f"their mean, plus {PENALTY:g} °C times the share of runs that do not settle at the "
-    "constant set point."
+    "constant set point; on another plant, that penalty is scaled with the set points."
 )
-# Neighbours of the paper's cases: samples, the first of them that counts, and arguments. Three
+PAPER = Parameters()
+QUIET: Arguments = {
+    "noise_variance": 0.0,
+    "measurement_noise_variance": 0.0,
+    "disturbance_amplitude": 0.0,
+    "disturbance_walk_variance": 0.0,
+}
+
+
+class TuningCase(NamedTuple):
+    """A case of the search: its length, where its mean error begins, and its plant."""
+
+    samples: int
+    first: int
+    arguments: Arguments
+
+
+# Neighbours of the paper's cases, whose first sample that counts is the second number. Three
 # count from an untrained controller on, and two count only what follows learning.
-CASES: dict[str, tuple[int, int, dict[str, float]]] = {
-    "constant": (600, 0, {"setpoint": 4.8}),
-    "dead zone": (
+CASES = {
+    "constant": TuningCase(600, 0, {"setpoint": 4.8}),
+    "dead zone": TuningCase(
         1280, 0, {"setpoint_amplitude": 5.1, "setpoint_period": 640, "dead_zone": 6.5}
     ),
-    "noise": (
+    "noise": TuningCase(
         1040, 0, {"setpoint_amplitude": 4.9, "setpoint_period": 520, "noise_variance": 0.4}
     ),
-    "learnt": (2240, 1120, {"setpoint_amplitude": 5.2, "setpoint_period": 560}),
-    "learnt, slow": (1920, 1280, {"setpoint_amplitude": 5.4, "setpoint_period": 640}),
-}  # fmt: skip
+    "learnt": TuningCase(2240, 1120, {"setpoint_amplitude": 5.2, "setpoint_period": 560}),
+    "learnt, slow": TuningCase(1920, 1280, {"setpoint_amplitude": 5.4, "setpoint_period": 640}),
+}
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Tune a controller's gains with Optuna.
+    """Tune a controller's gains with Optuna, by default on the paper's plant.
 
-    All trials use the same set points and seeds, which no comparison uses. If a search was
-    stopped, the same command with the same code goes on from there, to the same result.
+    All trials use the same set points and seeds, which no comparison uses. `gains.json` holds
+    the best gains: `benchmarks.compare --agent NAME=gains.json` runs the controller with them.
+    If a search was stopped, the same command with the same code goes on from there, to the same
+    result.
     """
 
     controller: Annotated[str, Parameter(choices=TUNED)] = field(kw_only=False)
@@ -60,6 +92,7 @@ class Options:
     """How many sets of gains to try."""
     runs: Runs = 100
     """Runs of each case in a trial."""
+    plant: PlantOptions = field(default_factory=PlantOptions)
     out: Folder = Path("results/tune")
 
 
@@ -70,30 +103,93 @@ def work(options: Options) -> str:
     from benchmarks.lib.report import Section, write_report
 
     name, made = options.controller, origin()
+    plant = options.plant.arguments()
     target = options.out / name
     with results_folder(target, conditions_of("tune", options)) as folder:
-        trials = pd.DataFrame(search(name, options.trials, options.runs, folder))
+        trials = pd.DataFrame(search(name, plant, options.trials, options.runs, folder))
+        table = finals(name, plant, trials)
+        samples = options.runs * sum(case.samples for case in cases(plant).values())
+        budget = f"{len(trials)} trials: {len(trials) * samples / 1e6:.0f} M samples"
+        names = [*spans_of(ROSTER[name], plant)]
+        content = {
+            "controller": name,
+            "gains": table.loc[0, names].to_dict(),
+            "plant": plant,
+            "knows": f"gains of a search on {options.plant.name or 'the paper plant'}",
+            "searched": f"{len(names)} gains by {budget}",
+        }
+        write_json(folder / "gains.json", content)
         title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS} new runs"
-        sections = [Section(title, [NOTE], finals(name, trials))]
+        sections = [Section(title, [NOTE], table.map("{:.4g}".format))]
         write_report(folder, f"Gains: {ROSTER[name].label}", sections, made)
-    return f"All trials are in {target}/trials.csv, the best in {target}/report.md"
+    return (
+        f"All trials are in {target}/trials.csv, the best in {target}/report.md. To compare "
+        f"them: python -m benchmarks.compare --agent my-{name}={target}/gains.json"
+    )
 
 
-def finals(name: str, trials: "pd.DataFrame") -> "pd.DataFrame":
-    """Score the best trials on new runs, and return them as text, a row each, the best first.
+def finals(name: str, plant: Arguments, trials: "pd.DataFrame") -> "pd.DataFrame":
+    """Score the best trials on new runs, and return a row for each, the best first.
 
     The best gains of a search owe some of their result to luck; new runs show how much.
     """
     import pandas as pd
 
     best = trials.nsmallest(FINALISTS, "objective")
-    gains = best[[*TUNED[name]]].map(lambda gain: float(f"{gain:.3g}")).to_dict("records")
-    table = pd.DataFrame([score(name, FINAL_RUNS, FINAL_FIRST_RUN, each) for each in gains])
+    names = [*spans_of(ROSTER[name], plant)]
+    gains: Any = best[names].map(lambda gain: float(f"{gain:.3g}")).to_dict("records")
+    rows = [score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, finalist) for finalist in gains]
+    table = pd.DataFrame(rows)
     table["in the search"] = best["objective"].to_numpy()
-    return table.sort_values("objective", ignore_index=True).map("{:.4g}".format)
+    return table.sort_values("objective", ignore_index=True)
 
 
-def search(name: str, count: int, runs: int, folder: Path) -> list[dict[str, float]]:
+def spans_of(spec: ControllerSpec, plant: Arguments) -> Mapping[str, tuple[float, float]]:
+    """Return where to search for each gain on a plant; `UsageError` if that is undefined."""
+    if spec.spans is None:
+        raise ValueError(f"{spec.name} has no gains to search")
+    with blame("--plant"):
+        return spec.spans(Parameters(**plant))
+
+
+def cases(plant: Arguments) -> dict[str, TuningCase]:
+    """Return the cases of a search on a plant, those of the paper's plant scaled.
+
+    Set points scale with `setpoint_amplitude`, lengths with `setpoint_period`, and the dead
+    zone and the noise with the plant's; a plant without noise has some in the case "noise".
+    At the constant set point there are neither noise nor load, so that a loop can settle.
+    """
+    parameters = Parameters(**plant)
+    amplitude = parameters.setpoint_amplitude / PAPER.setpoint_amplitude
+    duration = parameters.setpoint_period / PAPER.setpoint_period
+    limit = max(abs(parameters.range_of("u_min")[1]), abs(parameters.range_of("u_max")[0]))
+    zone = sum(parameters.range_of("dead_zone")) / 2.0 / PAPER.range_of("dead_zone")[0]
+    reaches = [
+        scales(each)["reach of half the flow's range, °C"] for each in (parameters, PAPER)
+    ]
+    noise = sum(parameters.range_of("noise_variance")) / 2.0 / 0.5  # 0.5: that of the paper
+    scaled: dict[str, TuningCase] = {}
+    for name, case in CASES.items():
+        arguments = {**plant, "setpoint": "square", **case.arguments}
+        if name == "constant":
+            arguments |= {**QUIET, "setpoint": amplitude * case.arguments["setpoint"]}
+        else:
+            period = case.arguments["setpoint_period"]
+            arguments["setpoint_period"] = max(2, 2 * round(duration * period / 2))
+            arguments["setpoint_amplitude"] *= amplitude
+        if name == "dead zone":
+            arguments["dead_zone"] = min(zone * case.arguments["dead_zone"], 0.95 * limit)
+        if name == "noise":
+            size = noise or (reaches[0] / reaches[1]) ** 2
+            arguments["noise_variance"] = size * case.arguments["noise_variance"]
+        samples, first = round(duration * case.samples), round(duration * case.first)
+        scaled[name] = TuningCase(samples, first, arguments)
+    return scaled
+
+
+def search(
+    name: str, plant: Arguments, count: int, runs: int, folder: Path
+) -> list[dict[str, float]]:
     """Try gains of a controller, and return and write one row for each trial.
 
     What a trial tries follows from those before it. So an interrupted search takes the same
@@ -104,8 +200,11 @@ def search(name: str, count: int, runs: int, folder: Path) -> list[dict[str, flo
 
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
     study, kept = optuna.create_study(), KeptResults(folder)
-    scale = partial(optuna.distributions.FloatDistribution, log=True)
-    spans: Any = {each: scale(*span) for each, span in TUNED[name].items()}
+    spans = spans_of(ROSTER[name], plant)
+    magnitudes: Any = {
+        gain: optuna.distributions.FloatDistribution(abs(least), abs(most), log=True)
+        for gain, (least, most) in spans.items()
+    }
     rows: list[dict[str, float]] = []
     try:
         with progress_bar("trials", count) as advance:
@@ -113,10 +212,14 @@ def search(name: str, count: int, runs: int, folder: Path) -> list[dict[str, flo
                 study.sampler = optuna.samplers.TPESampler(
                     seed=SEED + i, n_startup_trials=STARTUP, multivariate=True
                 )
-                trial = study.ask(spans)
+                trial = study.ask(magnitudes)
+                gains = {
+                    gain: math.copysign(size, spans[gain][0])
+                    for gain, size in trial.params.items()
+                }
                 row = kept.load(f"trial {i}")
                 if row is None:
-                    row = score(name, runs, FIRST_RUN, trial.params)
+                    row = score(name, plant, runs, FIRST_RUN, gains)
                     kept.save(f"trial {i}", row)
                 rows.append(row)
                 study.tell(trial, row["objective"])
@@ -127,19 +230,23 @@ def search(name: str, count: int, runs: int, folder: Path) -> list[dict[str, flo
     return rows
 
 
-def score(name: str, runs: int, first_run: int, gains: Mapping[Any, float]) -> dict[str, float]:
+def score(
+    name: str, plant: Arguments, runs: int, first_run: int, gains: Mapping[str, float]
+) -> dict[str, float]:
     """Return the gains, what `NOTE` says of a controller with them, and who does not settle.
 
     Each case has seeds of its own, beginning with `first_run`.
     """
-    controller = replace(ROSTER[name], make=partial(ROSTER[name].make, **gains))
-    medians = {}
-    for i, (case, (samples, first, arguments)) in enumerate(CASES.items()):
-        trajectory = controller.run(arguments, samples, runs, first_run + i * 100_000)
-        medians[case] = float(np.median(mean_error(trajectory[first:])))
-        if case == "constant":
+    controller = ROSTER[name].with_gains(gains)
+    medians, failed = {}, 0.0
+    for i, (case_name, case) in enumerate(cases(plant).items()):
+        seed = first_run + i * 100_000
+        trajectory = controller.run(case.arguments, case.samples, runs, seed)
+        medians[case_name] = float(np.median(mean_error(trajectory[case.first :])))
+        if case_name == "constant":
             failed = 1.0 - float(settled(trajectory).mean())
-    objective = float(np.mean(list(medians.values()))) + PENALTY * failed
+    penalty = PENALTY * Parameters(**plant).setpoint_amplitude / PAPER.setpoint_amplitude
+    objective = float(np.mean(list(medians.values()))) + penalty * failed
     return {**gains, **medians, "not converged": failed, "objective": objective}
 
 

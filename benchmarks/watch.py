@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.controllers.options import chosen
-from benchmarks.controllers.roster import ROSTER, Controller
+from benchmarks.controllers.options import agent_names, chosen
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.command import Seed, command, known, options
 from benchmarks.lib.errors import UsageError
 from benchmarks.lib.storage import file_name, out_folder, replacing
 from benchmarks.loop.rollout import held
 from benchmarks.loop.scenarios import SCENARIOS, PlantOptions, Scenario
 
-REFERENCE = ROSTER["nn-smith"]  # whose errors those of the film are multiples of
+REFERENCE = ROSTER["neural-smith"]  # whose errors those of the film are multiples of
 PICTURES = 60  # of a film, after the first
 STYLE: Any = {
     "font.size": 15,
@@ -48,7 +49,7 @@ def work(options: Options) -> str:
     cases = options.plant.cases(SCENARIOS)
     case = cases[known("--scenario", [options.scenario or next(iter(cases))], cases)[0]]
     own = "=" in options.agent
-    names = [] if own else known("--agent", [options.agent], ROSTER)
+    names = [] if own else agent_names("--agent", [options.agent])
     (controller,) = chosen(names, [options.agent] if own else []).values()
     name = f"{file_name(controller.name)}-{case.name}.gif"
     path = options.video or Path("results/watch", name)
@@ -70,7 +71,7 @@ def equal_steps(setpoint: NDArray[np.float64]) -> list[tuple[int, int]]:
     return [found[0], found[-1]] if len(found) > 1 else [(0, len(setpoint))]
 
 
-def write_film(path: Path, case: Scenario, controller: Controller, seed: int) -> str:
+def write_film(path: Path, case: Scenario, controller: ControllerSpec, seed: int) -> str:
     """Write a film of equal steps of a run, and return its title.
 
     The first picture shows all. Then the run goes on from sample to sample.

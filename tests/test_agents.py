@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 import agents
 from agents import (
     Controller,
+    DahlinController,
     DirectNNController,
     Increments,
     LawNetwork,
@@ -47,6 +48,11 @@ MAKERS = {
     for name, needed in NEEDS.items()
     if needed <= set(TOLD)
 }
+# A slow lambda would leave small errors inside the dead zone alone.
+INTERNAL_MODELS = (
+    partial(SmithPredictor, **TOLD),
+    partial(DahlinController, **{**TOLD, "closed_loop_time_constant": 16.0}),
+)
 WINDOWS = {"setpoint_window": 1, "output_window": 2, "action_window": 2}
 
 
@@ -297,17 +303,49 @@ def test_simc_by_hand():
         (2.0, {"dead_zone": 5.0, "u_min": -3.0}),  # the limit lies inside the dead zone
     ],
 )
-@pytest.mark.parametrize("delay", [0, 18])
-def test_with_the_right_model_there_is_no_delay_to_the_loop(setpoint, actuator, delay):
+def test_with_the_right_model_there_is_no_delay_to_the_loop(setpoint, actuator):
     # On a plant that is its model, the output is that of the loop without delay, later.
     pole = np.exp(-8 / 161)
     plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), **actuator}
     plant["setpoint"] = setpoint
-    smith = SmithPredictor(**{**TOLD, "delay": 8.0 * (delay + 1), **actuator})
-    late = rollout(make_plants(1, 200, **plant, delay=delay), smith, 200, seed=0)
-    prompt = PIController(smith.kp, smith.ki, anti_windup=True, u_min=smith.u_min)
-    soon = rollout(make_plants(1, 200, **plant, delay=0), prompt, 200, seed=0)
-    np.testing.assert_allclose(late.output[delay:], soon.output[: 200 - delay], atol=1e-4)
+    outputs = []
+    for delay in (0, 18):
+        smith = SmithPredictor(**{**TOLD, "delay": 8.0 * (delay + 1), **actuator})
+        trajectory = rollout(make_plants(1, 200, **plant, delay=delay), smith, 200, seed=0)
+        outputs.append(trajectory.output[delay : 182 + delay])
+    np.testing.assert_allclose(*outputs, atol=1e-4)
+
+
+def test_dahlins_response_is_a_first_order_lag_after_the_delay():
+    pole, samples = np.exp(-8 / 161), np.arange(100)
+    plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), "dead_zone": 0.0}
+    for filter_time_constant in (0.0, 100.0):
+        controller = DahlinController(**TOLD, filter_time_constant=filter_time_constant)
+        found = rollout(make_plants(1, 119, **plant, setpoint=2.0), controller, 119, seed=0)
+        # lambda = 80 s is ten samples; the delay is 19.
+        lag = 2.0 * (1.0 - np.exp(-samples / 10.0))
+        np.testing.assert_allclose(found.output[18:118, 0], lag, atol=1e-4)
+    # The filter acts on loads alone, of which it takes 1 - exp(-8 / 100) in the first sample.
+    commands = []
+    for filter_time_constant in (0.0, 100.0):
+        controller = DahlinController(**TOLD, filter_time_constant=filter_time_constant)
+        controller.act([0.0, 0.0, 0.0, 0.5])
+        commands.append(controller.command)
+    assert commands[1] / commands[0] == pytest.approx(1.0 - np.exp(-0.08))
+
+
+@pytest.mark.parametrize("make", INTERNAL_MODELS)
+def test_nothing_winds_up_at_a_limit_or_sticks_in_the_dead_zone(make):
+    controller = make(dead_zone=5.0)
+    # 9 degC are out of reach; 6 degC take 8.8 t/h. The valve must leave its limit at once.
+    plants = make_plants(1, 320, setpoint=[9.0] * 300 + [6.0])
+    applied = rollout(plants, controller, 320, seed=0).applied
+    assert (applied[290:300] == -10.0).all()
+    assert applied[300] > -10.0
+    # 1 degC takes 1.5 t/h, inside the zone: now and then 5 t/h pass, and never more.
+    held = rollout(make_plants(1, 900, setpoint=1.0), controller, 900, seed=0)
+    assert set(np.abs(held.applied[100:]).ravel()) == {0.0, 5.0}
+    assert np.abs(held.next_error[300:]).max() < 0.5
 
 
 def test_a_command_on_the_edge_of_the_dead_zone_has_an_effect():
@@ -451,6 +489,9 @@ BAD = {
     partial(PIController.simc, **STEP_TEST): [
         ("gain", 0.0), ("time_constant", 0.0), ("delay", -1.0), ("u_min", 10.0),
         ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0), ("u_min", -np.inf),
+    ],
+    partial(DahlinController, **TOLD): [
+        ("closed_loop_time_constant", 0.0), ("filter_time_constant", -1.0),
     ],
     partial(SmithPredictor, **TOLD): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
     partial(NeuralSmithPredictor, **STEP_TEST): [

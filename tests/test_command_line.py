@@ -52,7 +52,9 @@ LOG = ROOT / "benchmarks/identify/example.csv"
 REFUSED = {
     "claims": [(["everything"], "no 'everything'")],
     "compare": [
-        (["--agents", "nn", "pie"], '"pie" for --agents. Choose from: .* Did you mean "pi"'),
+        (["--agents", "nn", "pie"], "--agents: no 'pie'; there are idle, nn, "),
+        (["--agents", "nothing"], "--agents: 'nothing' is now called 'idle'"),
+        (["--agent", "mine=none.json"], "must be .* of a module or a file that is there"),
         (["--agents"], "no controller"),
         (["--scenarios", "circle"], "no 'circle'"),
         (["--scenarios"], "--scenarios: none to run"),
@@ -83,9 +85,16 @@ REFUSED = {
         (["--plants", "10"], "--plants and --design-seed are for --design random"),
         (["--out", __file__], "cannot be written to: File exists"),
     ],
-    "train": [(["pi"], '"pi" for NETWORK. Choose from: "nn-smith", "ppo"')],
+    "tune": [
+        (["pi", "--set", "b=[0.1,-0.1]"], "--plant: the gain must be finite and above 0 for a"),
+    ],
+    "train": [
+        (["nn-smith", "--set", "delay=9"], "--plant, --preset and --set are for ppo, not for"),
+        (["pi"], '"pi" for NETWORK. Choose from: "nn-smith", "ppo"'),
+    ],
     "watch": [
         (["--agent", "pi=none"], "--agent: .pi=none. must be .*; .pi. is taken"),
+        (["--agent", "nn-smith"], "--agent: 'nn-smith' is now called 'neural-smith'"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
         (["--scenario", "triangle"], "--scenario.*constant-noise"),
         (["--preset", "paper", "--scenario", "load"], "no 'load'; there are square, constant"),

@@ -298,12 +298,12 @@ class TestCompare:
 
     @pytest.mark.usefixtures("undrawn")
     def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):
-        out = compared("--presets --runs 2 --scenarios randomised --agents nn nn-smith")
+        out = compared("--presets --runs 2 --scenarios randomised --agents nn neural-smith")
         runs = pd.read_csv(out / "runs.csv").set_index("agent")
         estimates = pd.read_csv(out / "estimates.csv").set_index("agent")
         for agent in estimates.index:
             member = ROSTER[agent].members()[0]
-            controller = member(PRESETS["randomised"], 2, SEED)
+            controller = member.make(PRESETS["randomised"], 2, SEED)
             found = evaluate(controller, IDS["randomised"], episodes=2, **member.observation)
             row, against = runs.loc[agent], estimates.loc[agent]
             assert list(row["seed"]) == list(found.seeds)

@@ -44,7 +44,7 @@ def test_it_is_told_the_plant_that_it_is_made_for(entry, member):
     assert entry.searched
     plant = ACTUATOR if entry.name in UNTOLD else OTHER
     found = run_case(Scenario("other", "", 600, plant), member, 2).runs["mae"].to_numpy()
-    if entry.name == "nothing":
+    if entry.name == "idle":
         np.testing.assert_allclose(found, IDLE)
         return
     assert (found < 0.7 * IDLE).all()
@@ -58,7 +58,7 @@ def test_a_batch_is_its_members_again_and_mirrored(entry, member):
         # Plants with a limit that is nearer on one side, and set points beyond it.
         limits = {"u_min": -6.0, "u_max": 10.0} if sign > 0 else {"u_min": -10.0, "u_max": 6.0}
         plant = {**limits, "b": [sign * b for b in Parameters().b], "noise_variance": 0.1}
-        controller = controller or member(plant, runs, seed)
+        controller = controller or member.make(plant, runs, seed)
         plant |= {"setpoint_amplitude": 6.0, "setpoint_period": 200}
         return controller, member.run(plant, 160, runs, seed, controller)
 
@@ -77,7 +77,7 @@ def test_a_batch_is_its_members_again_and_mirrored(entry, member):
     _, mirrored = run(3, 5, sign=-1.0)
     # Actions have 24 bits, which limits the agreement.
     np.testing.assert_allclose(mirrored.command, -batch.command, atol=1e-2)
-    if entry.name != "nothing":
+    if entry.name != "idle":
         assert (batch.command > 9.99).any()  # the limits, and anti-windup, had a part
 
 
@@ -114,11 +114,11 @@ class TestOwnControllers:
         )
         named = code.format("num_envs, seed, parameters, gain=2", "locals()")
         (some,) = members_of(written(named))
-        given = some({"delay": 3}, 3, 7).given
+        given = some.make({"delay": 3}, 3, 7).given
         assert (given["num_envs"], given["seed"], given["gain"]) == (3, 7, 2)
         assert given["parameters"].delay == 3
         (everything,) = members_of(written(code.format("**offered", "offered")))
-        assert set(everything({}, 3, 7).given) == {
+        assert set(everything.make({}, 3, 7).given) == {
             "num_envs", "seed", "u_min", "u_max", "parameters",
         }  # fmt: skip
 
@@ -189,7 +189,7 @@ class TestSavedPolicies:
         (member,) = members_of(f"PPO:{file}")
         assert "weights: 0 M samples a policy" in member.provenance["searched"]
         assert ("note" in member.provenance) == (name == "bare")  # which is told to the user
-        controller = member(PRESETS[preset], 3, SEED)
+        controller = member.make(PRESETS[preset], 3, SEED)
         found = errors(member, 3, 100, **PRESETS[preset])
         model = PPO.load(file, device="cpu")
         env = copy.deepcopy(gymnasium.spec(IDS[preset]))

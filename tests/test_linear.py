@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from agents import PIController, SmithPredictor
+from agents import DahlinController, PIController, SmithPredictor
 from benchmarks.lib.errors import UsageError
-from benchmarks.loop.linear import nominal, step_test
+from benchmarks.loop.linear import LinearLoop, nominal, step_test, time_constant_for
+from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters
 from tests.conftest import STEP_TEST, run
@@ -89,7 +90,14 @@ def test_bad_plant_file_is_named(tmp_path):
 
 @pytest.mark.parametrize(
     "controller",
-    [PIController(0.5, 0.01), SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0)],
+    [
+        PIController(0.5, 0.01),
+        SmithPredictor(**STEP_TEST, closed_loop_time_constant=80.0),
+        DahlinController(**STEP_TEST, closed_loop_time_constant=80.0),
+        DahlinController(
+            **STEP_TEST, closed_loop_time_constant=80.0, filter_time_constant=50.0
+        ),
+    ],
 )
 def test_transfer_function_is_what_the_controller_does(controller):
     # Away from limits and dead zone, commands are the error, filtered.
@@ -102,3 +110,53 @@ def test_transfer_function_is_what_the_controller_does(controller):
     np.testing.assert_allclose(
         commands, signal.lfilter(*controller.transfer(), errors), atol=1e-9
     )
+
+
+class Proportional:
+    """u = Kp e."""
+
+    def __init__(self, kp):
+        self.kp = kp
+
+    def transfer(self):
+        return np.array([self.kp]), np.array([1.0])
+
+
+class TestLoop:
+    """Robustness: of an integrating plant, by hand; of the paper's, by running it."""
+
+    def test_sensitivity_and_delays_by_hand(self):
+        # y(k+1) = y(k) + u(k - d), u = Kp e: stable for Kp < 2 sin(pi / (4 d + 2)), which is
+        # 2, 1, 0.618, 0.445, ... for d = 0, 1, 2, 3. For d = 0, |S| is largest at z = -1.
+        integrator = nominal(Parameters(a=[1.0, -1.0], b=[1.0], delay=0))
+        for kp, longest in ((0.61, 2), (0.63, 1), (0.99, 1), (1.01, 0)):
+            loop = LinearLoop.of(Proportional(kp), integrator)
+            assert loop.stable_delays() == (0, longest)
+            assert loop.sensitivity() == pytest.approx(2.0 / (2.0 - kp))
+        unstable = LinearLoop.of(Proportional(2.01), integrator)
+        assert unstable.stable_delays() is None
+        assert unstable.sensitivity() == np.inf
+
+    def test_the_range_of_delays_is_that_of_loops_that_settle(self):
+        controller = SmithPredictor(**STEP_TEST, closed_loop_time_constant=25.0)
+        loop = LinearLoop.of(controller, nominal(Parameters()))
+        shortest, longest = loop.stable_delays()
+        assert 0 < shortest < 18 < longest < 30
+        for delay in (shortest - 1, shortest, longest, longest + 1):
+            plants = make_plants(1, 1500, setpoint=[1e-3, 0.0], delay=delay, dead_zone=0.0)
+            output = rollout(plants, controller, 1500, seed=0).output
+            growth = np.ptp(output[-300:]) / np.ptp(output[300:600])
+            assert (growth < 1.0) == (shortest <= delay <= longest)
+
+    def test_a_rule_is_slowed_down_until_its_sensitivity_is_the_target(self):
+        plant = nominal(Parameters())
+
+        def simc(time_constant):
+            return PIController.simc(**STEP_TEST, closed_loop_time_constant=time_constant)
+
+        found = time_constant_for(1.6, simc, plant, 5000.0, 1.0)
+        assert LinearLoop.of(simc(found), plant).sensitivity() == pytest.approx(1.6, rel=1e-4)
+        assert time_constant_for(1.7, simc, plant, 5000.0, 1.0) < found
+        assert time_constant_for(1.6, simc, plant, 5000.0, 200.0) == 200.0  # none is too fast
+        with pytest.raises(ValueError, match=r"no time constant up to 10 s .* Ms of 1\.6"):
+            time_constant_for(1.6, simc, plant, 10.0, 1.0)

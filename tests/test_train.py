@@ -144,7 +144,7 @@ def test_the_one_of_the_project_is_that_of_the_defaults():
     count = sum(W.size + len(b) for W, b in (*network.choosing, *network.adding))
     of = Training()
     samples = of.steps * of.plants * of.samples / 1e6
-    for name in ("nn-smith", "nn-self-tuning"):
+    for name in ("neural-smith", "neural-self-tuning"):
         assert f"{count:,} weights" in ROSTER[name].searched
         assert f": {samples:.0f} M samples" in ROSTER[name].searched
 

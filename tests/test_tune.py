@@ -9,6 +9,7 @@ import pytest
 from agents import DirectNNController
 from agents.pi import SEARCHED_GAINS
 from benchmarks import tune
+from benchmarks.controllers.plant_scale import NN_SPANS, PI_SPANS
 from benchmarks.loop.scenarios import SCENARIOS
 from tests.conftest import ROOT
 
@@ -16,10 +17,10 @@ from tests.conftest import ROOT
 class TestScore:
     def test_cases_are_met_by_no_comparison(self):
         compared = [case.arguments for case in SCENARIOS.values()]
-        assert not any(arguments in compared for _, _, arguments in tune.CASES.values())
+        assert not any(case.arguments in compared for case in tune.CASES.values())
 
     def test_no_control_pays_for_not_settling(self):
-        found = tune.score("pi", 2, 0, {"kp": 0.0, "ki": 0.0})
+        found = tune.score("pi", {}, 2, 0, {"kp": 0.0, "ki": 0.0})
         assert found["constant"] == pytest.approx(4.8)  # all of the set point, all the time
         assert found["learnt"] == pytest.approx(5.2)
         assert found["not converged"] == 1.0
@@ -34,8 +35,8 @@ def short(monkeypatch):
     monkeypatch.setattr(tune, "FINALISTS", 2)
     monkeypatch.setattr(tune, "STARTUP", 4)
     monkeypatch.setattr(tune, "FINAL_RUNS", 3)
-    cases = {name: (60, 0, arguments) for name, (_, _, arguments) in tune.CASES.items()}
-    monkeypatch.setattr(tune, "CASES", cases)
+    for name, case in tune.CASES.items():
+        monkeypatch.setitem(tune.CASES, name, case._replace(samples=60, first=0))
 
 
 def search(out, runs=2, status=0):
@@ -51,14 +52,14 @@ class TestSearch:
     def test_finalists_are_judged_rounded_on_new_runs(self, tmp_path, capsys):
         trials = search(tmp_path)
         assert len(trials) == 6
-        assert trials["kp"].between(*tune.TUNED["pi"]["kp"]).all()
+        assert trials["kp"].between(*PI_SPANS["kp"]).all()
         assert "The best" in capsys.readouterr().out
         page = (tmp_path / "pi/report.md").read_text().splitlines()
         table = [line for line in page if line.startswith("|")]
         rows = [[*map(float, line.split("|")[1:-1])] for line in table[2:]]
         assert len(rows) == 2
         for kp, ki, *_, objective, in_search in rows:
-            again = tune.score("pi", 3, tune.FINAL_FIRST_RUN, {"kp": kp, "ki": ki})
+            again = tune.score("pi", {}, 3, tune.FINAL_FIRST_RUN, {"kp": kp, "ki": ki})
             assert objective == pytest.approx(again["objective"], rel=1e-3)
             assert np.isclose(trials["objective"], in_search, rtol=1e-3).any()
 
@@ -101,5 +102,5 @@ def test_the_pages_of_the_searches_name_the_defaults():
     pages = (ROOT / f"benchmarks/published/tune_{name}.md" for name in ("nn", "pi"))
     nn, pi = (page.read_text(encoding="utf-8") for page in pages)
     own = DirectNNController()
-    assert f"({', '.join(f'{name} {getattr(own, name):g}' for name in tune.TUNED['nn'])})" in nn
+    assert f"({', '.join(f'{name} {getattr(own, name):g}' for name in NN_SPANS)})" in nn
     assert "gains, {kp:g} and {ki:g}, are".format(**SEARCHED_GAINS) in pi

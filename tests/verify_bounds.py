@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.bounds.least import least_possible
-from benchmarks.controllers.roster import EVERYTHING, ROSTER, Controller
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.spec import EVERYTHING, ControllerSpec
 from benchmarks.lib.report import on_screen
 from benchmarks.lib.statistics import student
 from benchmarks.loop.linear import nominal
@@ -55,7 +56,13 @@ class Counting:
 
 
 CONTROLLERS = {name: entry.members()[0] for name, entry in ROSTER.items()} | {
-    "counting": Controller("counting", "counting", ("", ""), Counting, told=EVERYTHING)
+    "counting": ControllerSpec(
+        name="counting",
+        label="counting",
+        look=("", ""),
+        build=Counting,
+        prior_knowledge=EVERYTHING,
+    )
 }
 
 

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.controllers.roster import ROSTER, Controller, label
+from benchmarks.controllers.roster import ROSTER, label
+from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles, written
 from benchmarks.lib.storage import write_csv
 from benchmarks.loop.rollout import CHANGE, START, Trajectory, is_random, measure
 from benchmarks.loop.scenarios import Scenario
+from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES
 
 BOOTSTRAP = 0  # seed of the bootstraps
@@ -26,6 +28,12 @@ BOUND = (
     "the plant settled. A controller that knows the timetable can be between the two."
 )
 PAIRED = "Below 0 a controller is better; in % the share of runs in which it is."
+ROBUST = (
+    "Ms, the largest sensitivity, and the range of delays around the plant's with which the "
+    "loop is stable: of linear controllers with the nominal plant of the first case, away from "
+    "the dead zone and the limits. SIMC, Smith and Dahlin are tuned to the same Ms."
+)
+MARK = "†"  # of controllers that were made for another plant
 PARTS = {
     "mae_start": f"first {START} samples",
     "mae_changes": f"{CHANGE} samples after later changes",
@@ -46,7 +54,7 @@ class Case:
     seconds: float  # processor time of the runs
 
 
-def run_case(scenario: Scenario, controller: Controller, runs: int, seed: int) -> Case:
+def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: int) -> Case:
     """Run all members of a controller on a case; run i has the seed `seed + i`.
 
     Where nothing is drawn, all runs are alike: then there is one, and its row is repeated.
@@ -143,8 +151,21 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def ranked(estimates: pd.DataFrame) -> dict[str, Estimate]:
-    """Return the overall scores of all agents, the best first.
+def misfits_of(
+    controllers: Mapping[str, ControllerSpec], plants: Sequence[Parameters]
+) -> dict[str, str]:
+    """Return the controllers that were made for other plants, and why, in a sentence each."""
+    misfits: dict[str, str] = {}
+    for name, spec in controllers.items():
+        for plant in plants:
+            reason = spec.misfit(plant)
+            if reason:
+                misfits.setdefault(name, reason)
+    return misfits
+
+
+def ranked(estimates: pd.DataFrame, misfits: Collection[str] = ()) -> dict[str, Estimate]:
+    """Return the overall scores of all agents, the best first; `misfits` come last.
 
     They are means over the cases, however hard these are. The 95 % intervals resample policies
     and runs within each case.
@@ -153,7 +174,7 @@ def ranked(estimates: pd.DataFrame) -> dict[str, Estimate]:
         str(agent): bootstrap(*tables, seed=BOOTSTRAP)
         for agent, tables in estimates.groupby("agent", sort=False)["scores"]
     }
-    return dict(sorted(scores.items(), key=lambda each: -each[1].value))
+    return dict(sorted(scores.items(), key=lambda item: (item[0] in misfits, -item[1].value)))
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
@@ -172,7 +193,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 def write(
     cases: Sequence[Case],
     found: Sequence[Scale],
-    controllers: Mapping[str, Controller],
+    controllers: Mapping[str, ControllerSpec],
     folder: Path,
     made: Mapping[str, Any],
 ) -> None:
@@ -192,19 +213,26 @@ def write(
     if runs.empty:
         return
     estimates = estimate(runs, scales)
-    scores = ranked(estimates)
+    plants = [scale.scenario.parameters for scale in scales.values()]
+    misfits = misfits_of(controllers, plants)
+    scores = ranked(estimates, misfits)
     write_numbers(folder / "estimates.csv", estimates.drop(columns="scores"))
     errors = runs.groupby(["scenario", "agent"])["mae"].mean()
-    drawn = [name for name, each in controllers.items() if each.drawn]
+    pictured = [
+        name for name, spec in controllers.items() if spec.pictured and name not in misfits
+    ]
     from benchmarks.compare import plots  # here: processes that run cases do without
 
-    plots.plot_scores(scores, estimates, folder / "scores.png")
-    plots.plot_travel(runs, estimates, [*scores], folder / "travel.png")
+    fitting = {agent: score for agent, score in scores.items() if agent not in misfits}
+    if fitting:
+        plots.plot_scores(fitting, estimates, folder / "scores.png")
+        shown = runs[runs["agent"].isin(fitting)]
+        plots.plot_travel(shown, estimates, [*fitting], folder / "travel.png")
     for name, scale in scales.items():
-        few = responses[name][responses[name]["agent"].isin(drawn)]
+        few = responses[name][responses[name]["agent"].isin(pictured)]
         rows, path = responses[name] if few.empty else few, folder / f"{name}.png"
         plots.plot_responses(rows, errors[name], scale.scenario, path)
-    sections = report(runs, estimates, scores, scales, cases, controllers)
+    sections = report(runs, estimates, scores, scales, cases, controllers, misfits)
     write_report(folder, "Comparison of controllers", sections, made, printed=2)
 
 
@@ -231,11 +259,16 @@ def report(
     scores: Mapping[str, Estimate],
     scales: Mapping[str, Scale],
     cases: Sequence[Case],
-    controllers: Mapping[str, Controller],
+    controllers: Mapping[str, ControllerSpec],
+    misfits: Mapping[str, str],
 ) -> list[Section]:
     """Return the sections of the report that have anything to show."""
     reference = str(runs["agent"].iloc[0])
     notes = {each["note"] for case in cases for each in case.policies if "note" in each}
+    not_ranked = [
+        f"{MARK} Not ranked, as its error here is no result: {reason}"
+        for reason in misfits.values()
+    ]
     paired = difference_table(estimates)
     parts = runs[runs["scenario"] == "hard"].groupby("agent")[[*PARTS]].mean()
     parts = parts.sort_values("mae").map("{:.3f}".format).rename(index=label, columns=PARTS)
@@ -243,8 +276,8 @@ def report(
     sections = [
         Section(
             "Score: 0 without control, 1 at the least possible error",
-            [SCORE, *sorted(notes)],
-            score_table(runs, estimates, scores),
+            [SCORE, *sorted(notes), *not_ranked],
+            score_table(runs, estimates, scores, misfits),
             {
                 "scores.png": "The score of each controller, and a tick for each case",
                 "travel.png": "The mean error over valve travel: down and left is better",
@@ -261,24 +294,42 @@ def report(
             ["Contributions to the mean error, °C: means of all runs."],
             parts.rename_axis("controller").reset_index(),
         ),
-        Section("What each controller costs", table=costs_table(cases, controllers)),
+        Section(
+            "What each controller knows and costs",
+            [ROBUST],
+            costs_table(cases, controllers, next(iter(scales.values())).scenario),
+        ),
         Section(
             "Cases",
             table=pd.DataFrame(titles.items(), columns=["case", "what it is"]),
             pictures={f"{name}.png": f"Responses: {title}" for name, title in titles.items()},
         ),
     ]
+    marks = {label(agent): f"{label(agent)} {MARK}" for agent in misfits}
+    for section in sections:
+        if section.table is not None and "controller" in section.table:
+            section.table["controller"] = section.table["controller"].replace(marks)
     return [each for each in sections if each.table is None or len(each.table)]
 
 
 def score_table(
-    runs: pd.DataFrame, estimates: pd.DataFrame, scores: Mapping[str, Estimate]
+    runs: pd.DataFrame,
+    estimates: pd.DataFrame,
+    scores: Mapping[str, Estimate],
+    misfits: Collection[str] = (),
 ) -> pd.DataFrame:
-    """Return the scores and the mean travel of the median runs, the best first."""
+    """Return the scores and the mean travel of the median runs, the best first.
+
+    Controllers in `misfits` have no score.
+    """
     cells = estimates["scores"].map(lambda each: written(each.mean(), ".2f"))
     table = _by_agent(estimates, cells, [*scores])
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
-    table.insert(1, "score", [f"{score:.3f}" for score in scores.values()])
+    overall = [f"{score:.3f}" for score in scores.values()]
+    for place, agent in enumerate(scores):
+        if agent in misfits:
+            overall[place] = "not ranked"
+    table.insert(1, "score", overall)
     table.insert(2, "travel (t/h)", [f"{travels[agent].mean():,.0f}" for agent in scores])
     return table
 
@@ -312,15 +363,37 @@ def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataF
     return table.rename_axis(index="controller", columns=None).reset_index()
 
 
-def costs_table(cases: Sequence[Case], controllers: Mapping[str, Controller]) -> pd.DataFrame:
-    """Return what each controller is told, what it took before, and the time of its runs."""
+def costs_table(
+    cases: Sequence[Case], controllers: Mapping[str, ControllerSpec], scenario: Scenario
+) -> pd.DataFrame:
+    """Return a row for each controller: its knowledge, its robustness and its costs.
+
+    The robustness of linear controllers is that with the nominal plant of the scenario.
+    """
     rows = []
     for name, controller in controllers.items():
-        own = [case for case in cases if case.agent == name]
+        own_cases = [case for case in cases if case.agent == name]
         # The roster says it in a record, a user's own controller itself.
-        said = next((dict(policy) for case in own for policy in case.policies), {})
-        knows = controller.knows or said.get("knows", "")
-        searched = controller.searched or said.get("searched", "")
-        rows.append([label(name), knows, searched, f"{sum(case.seconds for case in own):.1f}"])
-    columns = ["controller", "prior knowledge", "searched or trained", "processor time (s)"]
-    return pd.DataFrame(rows, columns=columns)
+        about = next((dict(policy) for case in own_cases for policy in case.policies), {})
+        sensitivity, delays = robustness(controller, scenario)
+        row = {
+            "controller": label(name),
+            "prior knowledge": controller.knows or about.get("knows", ""),
+            "Ms": sensitivity,
+            "stable with delays of (samples)": delays,
+            "searched or trained": controller.searched or about.get("searched", ""),
+            "processor time (s)": f"{sum(case.seconds for case in own_cases):.1f}",
+        }
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def robustness(controller: ControllerSpec, scenario: Scenario) -> tuple[str, str]:
+    """Return Ms and the range of delays of a linear controller's loop, as texts."""
+    if not controller.linear:
+        return "", ""
+    loop = controller.loop(scenario.arguments)
+    delays = loop.stable_delays()
+    if delays is None:
+        return "unstable", "none around the plant's"
+    return f"{loop.sensitivity():.2f}", f"{delays[0]} to {delays[1]}"

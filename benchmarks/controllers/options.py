@@ -5,24 +5,31 @@ The code of a user's own runs in the tasks that need it: what is wrong with it c
 
 import importlib.util
 import inspect
+import json
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+from agents import PolicyNetwork
 from agents.controller import PAPER_WINDOWS
 from agents.networks import WINDOWS
-from benchmarks.controllers.roster import EVERYTHING, LIMITS, OWN, ROSTER, Controller
-from benchmarks.lib.command import FanOut, Names, Parameter, blame, options
+from benchmarks.controllers.roster import OWN_LOOKS, RENAMED, ROSTER
+from benchmarks.controllers.spec import EVERYTHING, LIMITS, ControllerSpec
+from benchmarks.lib.command import FanOut, Names, Parameter, blame, known, options
 from benchmarks.lib.errors import UsageError
 from mptc_gym import IDS, Parameters
 from mptc_gym.acting import check_fit, natives, opened, start
 from mptc_gym.evaluation import case_of
 
-AgentNames = Annotated[Names, Parameter(help="Controllers to run.", choices=ROSTER)]
+AgentNames = Annotated[Names, Parameter(help=f"Controllers to run, of {', '.join(ROSTER)}.")]
+FORMS = (
+    "NEW_NAME=MODULE:FACTORY, NEW_NAME=PPO:FILE.zip, NEW_NAME=gains.json of benchmarks.tune or "
+    "NEW_NAME=FILE.npz of benchmarks.train"
+)
 
 
 @options
@@ -31,37 +38,104 @@ class ControllerOptions:
     """A user's own controllers, and where controllers run."""
 
     agent: Names = ()
-    """A controller of your own in addition to those of --agents, NAME=MODULE:FACTORY or
-    NAME=PPO:FILE.zip, of Stable-Baselines3; loading a zip runs the code in it. The same name
-    again adds another training of it."""
+    """A controller of your own in addition to those of --agents: NAME=MODULE:FACTORY;
+    NAME=PPO:FILE.zip, of Stable-Baselines3 (loading a zip runs the code in it);
+    NAME=gains.json, which benchmarks.tune writes; or NAME=FILE.npz, of benchmarks.train. The
+    same name again adds another training of it."""
     fan_out: FanOut = field(default_factory=FanOut)
 
 
-def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controller]:
+def agent_names(option: str, names: Sequence[str]) -> list[str]:
+    """Return names of the roster, each once; a `UsageError` names what is not in it."""
+    for name in names:
+        if name in RENAMED:
+            raise UsageError(f"{option}: {name!r} is now called {RENAMED[name]!r}")
+    return known(option, names, ROSTER)
+
+
+def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, ControllerSpec]:
     """Return controllers of the roster by name, then a user's own, as given to `--agent`.
 
-    These have a member for each location. `members` raises a `UsageError` if one is faulty.
+    These have a member for each location. A `UsageError` names what is missing or not of the
+    right form; `members` raises one for a faulty module or zip.
     """
-    locations: dict[str, tuple[str, ...]] = {}
-    for text in own:
-        name, _, location = text.partition("=")
-        taken = f"; {name!r} is taken" if name.lower() in ROSTER else ""
-        module, colon, file = location.partition(":")
-        is_zip, package = location.endswith(".zip"), module.partition(".")[0] or "-"
-        there = Path(file).is_file() if is_zip else importlib.util.find_spec(package)
-        if taken or not (name and colon and there):
-            raise UsageError(
-                f"--agent: {text!r} must be NEW_NAME=MODULE:FACTORY or NEW_NAME=PPO:FILE.zip, "
-                f"of a module or a file that is there{taken}"
-            )
-        locations[name] = *locations.get(name, ()), location
     if not (names or own):
         raise UsageError("--agents, --agent: no controller to run")
-    about: Any = {"told": (*EVERYTHING, *LIMITS), "random": True, "drawn": True}
-    return {name: ROSTER[name] for name in names} | {
-        name: Controller(name, name, OWN[0], _make, networks=partial(_found, each), **about)
-        for name, each in locations.items()
-    }
+    specs = {name: ROSTER[name] for name in agent_names("--agents", names)}
+    locations: dict[str, list[str]] = {}
+    for text in own:
+        name, location = _split(text)
+        locations.setdefault(name, []).append(location)
+    for name, places in locations.items():
+        specs[name] = _own_spec(name, places)
+    return specs
+
+
+def _split(text: str) -> tuple[str, str]:
+    """Return the name and the location in a value of `--agent`; `UsageError` if one is bad."""
+    name, _, location = text.partition("=")
+    taken = f"; {name!r} is taken" if name.lower() in ROSTER else ""
+    module, colon, file = location.partition(":")
+    if location.endswith((".json", ".npz")):
+        exists = Path(location).is_file()
+    elif location.endswith(".zip"):
+        exists = bool(colon) and Path(file).is_file()
+    else:
+        package = module.partition(".")[0] or "-"
+        exists = bool(colon and file) and importlib.util.find_spec(package) is not None
+    if taken or not (name and exists):
+        raise UsageError(
+            f"--agent: {text!r} must be {FORMS}, of a module or a file that is there{taken}"
+        )
+    return name, location
+
+
+def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
+    """Return the record of a user's own controller at these locations."""
+    files = [Path(location) for location in locations]
+    suffixes = {file.suffix for file in files}
+    try:
+        if suffixes == {".json"} and len(files) == 1:
+            return _searched(name, files[0])
+        if suffixes == {".npz"}:
+            return _trained(name, files)
+    except (KeyError, OSError, TypeError, ValueError) as error:
+        wanted = "a gains.json of benchmarks.tune or a network of benchmarks.train"
+        raise UsageError(f"--agent: {name}={locations[0]} must be {wanted}: {error}") from error
+    return ControllerSpec(
+        name=name,
+        label=name,
+        look=OWN_LOOKS[0],
+        build=_make,
+        prior_knowledge=(*EVERYTHING, *LIMITS),
+        networks=partial(_found, locations),
+        random=True,
+        pictured=True,
+    )
+
+
+def _searched(name: str, file: Path) -> ControllerSpec:
+    """Return the controller whose gains `benchmarks.tune` found, for the plant it used."""
+    content = json.loads(file.read_text(encoding="utf-8"))
+    spec = ROSTER[content["controller"]].with_gains(content["gains"])
+    about = {"made_for": content["plant"], "searched": content["searched"]}
+    return replace(spec, name=name, label=name, knows=content["knows"], **about)
+
+
+def _trained(name: str, files: Sequence[Path]) -> ControllerSpec:
+    """Return the policies that `benchmarks.train ppo` wrote, for the plant it used."""
+    networks = {str(file): PolicyNetwork.load(file) for file in files}
+    first = next(iter(networks.values())).provenance
+    samples = f"{first.get('steps', 0) / 1e6:.3g} M samples a policy"
+    return replace(
+        ROSTER["ppo"],
+        name=name,
+        label=name,
+        knows="trained on a simulator of this plant",
+        searched=f"trained by PPO: {samples}",
+        made_for=first.get("plant", {}),
+        networks=partial(dict, networks),
+    )
 
 
 @dataclass(frozen=True)
@@ -74,10 +148,12 @@ class Own:
 
 
 def _found(locations: Sequence[str]) -> dict[str, Own]:
-    return {each: _loaded(each) for each in locations}
+    """Return what is found at each location."""
+    return {location: _loaded(location) for location in locations}
 
 
 def _loaded(location: str) -> Own:
+    """Return what is found at a location, a module or a zip."""
     try:
         return _saved(location) if location.endswith(".zip") else _imported(location)
     except (Exception, SystemExit) as error:  # whatever a user's code or file raises
@@ -116,17 +192,16 @@ def _saved(location: str) -> Own:
     return Own(lambda: model, provenance=about)
 
 
-def _make(*, network: Own, **told: Any) -> Any:
+def _make(*, network: Own, **known: Any) -> Any:
     """Call a user's factory with the arguments that it accepts, by name."""
     accepted = inspect.signature(network.factory).parameters
-    takes_all = any(each.kind is each.VAR_KEYWORD for each in accepted.values())
-    made = network.factory(
-        **{name: told[name] for name in told if takes_all or name in accepted}
-    )
-    if hasattr(made, "reset") and hasattr(made, "act"):
-        return made
-    policy, env = made if isinstance(made, tuple) else (made, None)
-    return Policy(policy, env, told["num_envs"])
+    takes_all = any(argument.kind is argument.VAR_KEYWORD for argument in accepted.values())
+    arguments = {name: known[name] for name in known if takes_all or name in accepted}
+    controller = network.factory(**arguments)
+    if hasattr(controller, "reset") and hasattr(controller, "act"):
+        return controller
+    policy, env = controller if isinstance(controller, tuple) else (controller, None)
+    return Policy(policy, env, known["num_envs"])
 
 
 @dataclass

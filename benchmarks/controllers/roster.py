@@ -1,16 +1,17 @@
-"""List the controllers: one record each, with all that the commands need to know of it.
+"""List the controllers: one record each.
 
 A controller is added here and nowhere else: `compare`, `sweep`, `tune` and `watch` then know
 it. A user's own (`--agent NAME=MODULE:FACTORY`) becomes such a record, too.
 """
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
 from agents import (
+    DahlinController,
     DirectNNController,
     LawNetwork,
     NeuralSelfTuningController,
@@ -20,116 +21,25 @@ from agents import (
     SelfTuningController,
     SmithPredictor,
 )
-from agents.controller import PAPER_WINDOWS
 from agents.networks import PRETRAINED
 from agents.pi import SEARCHED_GAINS
+from benchmarks.controllers import plant_scale
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.loop.linear import nominal, step_test
-from benchmarks.loop.rollout import Agent, IdleValve, Trajectory, make_plants, rollout
-from mptc_gym import Parameters
+from benchmarks.controllers.spec import (
+    DATA_SHEET,
+    DIRECTION,
+    EVERYTHING,
+    LIMITS,
+    ROBUSTNESS,
+    STEP_TEST,
+    ControllerSpec,
+)
+from benchmarks.loop.rollout import Agent, IdleValve
+from mptc_gym import PRESETS, Parameters
 
-LEARNING = 1200  # samples of the square wave on which a network is commissioned
-COMMISSIONING_SEED = 3_000_000  # of plants and noise during commissioning
-OWN = ("#5B3FA6", "P"), ("#B22222", "X")
-
-# What a controller may be told, by the arguments of its `make`.
-LIMITS = "u_min", "u_max"
-DIRECTION = *LIMITS, "direction", "num_envs", "seed"
-STEP_TEST = *LIMITS, "gain", "time_constant", "delay", "sampling_interval"
-DATA_SHEET = *STEP_TEST, "dead_zone"
-EVERYTHING = "parameters", "num_envs", "seed"
-
-
-def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
-    """Return what a controller is told of a plant, for a number of runs and a seed.
-
-    Run i uses `seed + i`. Of what is drawn from ranges these are the widest limits, the middle
-    of the dead zone and the step test of the plant in the middle.
-    """
-    told: dict[str, Any] = {"parameters": plant, "num_envs": runs, "seed": seed}
-    told |= {"u_min": plant.range_of("u_min")[0], "u_max": plant.range_of("u_max")[1]}
-    told["dead_zone"] = sum(plant.range_of("dead_zone")) / 2
-    if "direction" in names:
-        told["direction"] = 1 if nominal(plant).gain > 0.0 else -1
-    if "gain" in names:
-        told |= step_test(plant)
-        half = told["time_constant"] / 2  # that of the closed loop
-        told["closed_loop_time_constant"] = float(f"{half:.2g}")
-    return {name: told[name] for name in names}
-
-
-@dataclass(frozen=True)
-class Controller:
-    """A controller, or one that was trained, as all commands know it."""
-
-    name: str  # in options and files
-    label: str  # in tables and pictures
-    look: tuple[str, str]  # colour and marker in pictures: those of relatives are alike
-    # Makes it from what it is told, searched gains by name, and a `network` of its own.
-    make: Callable[..., Agent]
-    _: KW_ONLY
-    told: Sequence[str] = LIMITS  # arguments of `make`, as `knowledge` returns them
-    knows: str = ""  # what it is told about the plant, in words
-    searched: str = ""  # or trained, and in how many trials and samples of the plant
-    # Windows that it expects, by the environment's arguments.
-    observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
-    # Reads the networks that were trained separately, by file: each makes a member.
-    networks: Callable[[], Mapping[str, Any]] | None = None
-    random: bool = False  # it draws something itself, such as its first weights
-    learns: bool = False  # from run to run
-    # Lowest and highest value of each of its gains in a search, by name.
-    gains: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    compared: bool = True  # by default, in `compare`
-    swept: bool = True  # likewise, in `sweep`
-    drawn: bool = False  # its responses are, in a comparison
-    # Origin of a trained network, JSON-serialisable; empty if nothing was trained.
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-
-    def members(self) -> "list[Controller]":
-        """Return the controller, or one for each of the networks that it was trained to."""
-        if self.networks is None:
-            return [self]
-        return [
-            replace(
-                self,
-                make=partial(self.make, network=network),
-                observation=getattr(network, "observation", self.observation),
-                provenance={"file": file, **network.provenance},
-                networks=None,
-            )
-            for file, network in sorted(self.networks().items())
-        ]
-
-    def __call__(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller for `runs` plants, made for the plant with these arguments."""
-        parameters = Parameters(**{**plant, **self.observation})
-        return self.make(**knowledge(self.told, parameters, runs, seed))
-
-    def run(
-        self,
-        plant: Mapping[str, Any],
-        samples: int,
-        runs: int,
-        seed: int,
-        controller: Agent | None = None,
-    ) -> Trajectory:
-        """Run the given controller, by default a new one for this plant; see `rollout`."""
-        agent, arguments = controller or self(plant, runs, seed), {**plant, **self.observation}
-        if hasattr(agent, "opened"):  # a user's, that acts in its own
-            with agent.opened(samples, **arguments) as plants:
-                return rollout(plants, agent, samples, seed)
-        return rollout(make_plants(runs, samples, **arguments), agent, samples, seed)
-
-    def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller that is ready for plants it was not made for.
-
-        A controller that learns has already learnt on the plant it is made for.
-        """
-        controller = self(plant, runs, seed)
-        if self.learns:
-            square = {**plant, "setpoint": "square"}
-            self.run(square, LEARNING, runs, COMMISSIONING_SEED, controller)
-        return controller
+LAMBDA = 0.1  # closed-loop time constant of Dahlin's controller, as a share of the plant's
+# Colours and markers of a user's own controllers, in turn.
+OWN_LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "p"), ("#17798C", "h")
 
 
 def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
@@ -137,6 +47,12 @@ def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
     controller: Any = ROSTER["nn"].in_service(asdict(parameters), num_envs, seed)
     controller.learning = False
     return controller  # type: ignore[no-any-return]
+
+
+def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
+    """Return Dahlin's controller, by default with a lambda of a tenth of the time constant."""
+    arguments.setdefault("closed_loop_time_constant", LAMBDA * time_constant)
+    return DahlinController(time_constant=time_constant, **arguments)
 
 
 def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -> Agent:
@@ -162,85 +78,181 @@ _LAW = (
     "8,894 weights for all plants: 46 M samples, once, 10 min; 9 such trainings, 110 settings "
     "by hand"
 )
-_RULE = "nothing: one step test, a rule"
+_RULE = f"nothing: one step test, a rule, slowed down to Ms {ROBUSTNESS:g}"
 _NETWORK = partial(trained, LawNetwork, "nn-smith.npz")
-
-ROSTER = {each.name: each for each in (
-    Controller(
-        "nothing", "no control", ("#8C8C8C", "x"), IdleValve,
-        knows="nothing", searched="nothing", observation={}, compared=False, swept=False,
+_SPECS = (
+    ControllerSpec(
+        name="idle",
+        label="idle valve",
+        look=("#8C8C8C", "x"),
+        build=IdleValve,
+        knows="nothing",
+        searched="nothing",
+        observation={},
+        compared=False,
+        swept=False,
     ),
-    Controller(
-        "nn", "NN (1992)", ("#D55E00", "o"), DirectNNController, told=DIRECTION,
-        knows="direction", searched=_NN, random=True, learns=True, drawn=True,
-        gains={
-            "eta": (1e-3, 10.0),
-            "eta_1": (1e-3, 1.0),
-            "eta_theta": (1e-4, 1.0),
-            "eta_1_theta": (1e-4, 1.0),
-            "input_scale": (0.02, 1.0),
-            "weight_scale": (0.05, 2.0),
-        },
+    ControllerSpec(
+        name="nn",
+        label="NN (1992)",
+        look=("#D55E00", "o"),
+        build=DirectNNController,
+        prior_knowledge=DIRECTION,
+        knows="direction; gains searched on the paper's plant",
+        searched=_NN,
+        assumes=("scale",),
+        random=True,
+        learns=True,
+        spans=plant_scale.nn_spans,
+        pictured=True,
     ),
-    Controller(
-        "nn-frozen", "NN (1992), frozen", ("#7A3600", "o"), frozen_nn, told=EVERYTHING,
-        knows="direction", searched=f"{_NN}; 1,200 samples before", random=True, compared=False,
+    ControllerSpec(
+        name="nn-frozen",
+        label="NN (1992), frozen",
+        look=("#7A3600", "o"),
+        build=frozen_nn,
+        prior_knowledge=EVERYTHING,
+        knows="direction; gains searched on the paper's plant",
+        searched=f"{_NN}; 1,200 samples before",
+        assumes=("scale",),
+        random=True,
+        compared=False,
     ),
-    Controller(
-        "pi", "PI (1992)", ("#CC79A7", "s"), PIController,
-        knows="gains of the paper", searched="2 gains, not stated how", drawn=True,
-        gains={"kp": (0.1, 10.0), "ki": (1e-3, 1.0)},
+    ControllerSpec(
+        name="pi",
+        label="PI (1992)",
+        look=("#CC79A7", "s"),
+        build=PIController,
+        knows="gains of the paper, for its plant",
+        searched="2 gains, not stated how",
+        linear=True,
+        assumes=("direction", "scale"),
+        spans=plant_scale.pi_spans,
+        pictured=True,
     ),
-    Controller(
-        "pi-simc", "PI (SIMC)", ("#8E3B6B", "s"), PIController.simc, told=STEP_TEST,
-        knows=_STEP_TEST, searched=_RULE,
+    ControllerSpec(
+        name="pi-simc",
+        label="PI (SIMC)",
+        look=("#8E3B6B", "s"),
+        build=PIController.simc,
+        prior_knowledge=STEP_TEST,
+        knows=_STEP_TEST,
+        searched=_RULE,
+        tuned_by="closed_loop_time_constant",
+        linear=True,
     ),
-    Controller(
-        "pi-searched", "PI (searched)", ("#4F1F3B", "s"),
-        partial(PIController, kp=SEARCHED_GAINS["kp"], ki=SEARCHED_GAINS["ki"]),
-        knows="gains of the search",
-        searched="2 gains by 800 trials: 566 M samples, 3 min", swept=False,
+    ControllerSpec(
+        name="pi-searched",
+        label="PI (searched)",
+        look=("#4F1F3B", "s"),
+        build=partial(PIController, kp=SEARCHED_GAINS["kp"], ki=SEARCHED_GAINS["ki"]),
+        knows="gains of the search, for the paper's plant",
+        searched="2 gains by 800 trials: 566 M samples, 3 min",
+        linear=True,
+        assumes=("direction", "scale"),
+        swept=False,
     ),
-    Controller(
-        "smith", "Smith", ("#56B4E9", "^"), SmithPredictor,
-        told=(*DATA_SHEET, "closed_loop_time_constant"),
-        knows=_DATA_SHEET, searched=_RULE,
+    ControllerSpec(
+        name="smith",
+        label="Smith",
+        look=("#56B4E9", "^"),
+        build=SmithPredictor,
+        prior_knowledge=DATA_SHEET,
+        knows=_DATA_SHEET,
+        searched=_RULE,
+        tuned_by="closed_loop_time_constant",
+        linear=True,
     ),
-    Controller(
-        "self-tuning", "self-tuning", ("#00B98A", "v"),
-        SelfTuningController, told=DATA_SHEET, knows=f"{_DATA_SHEET}; delay range",
+    ControllerSpec(
+        name="dahlin",
+        label="Dahlin",
+        look=("#003F7D", "<"),
+        build=dahlin,
+        prior_knowledge=DATA_SHEET,
+        knows=_DATA_SHEET,
+        searched=f"{_RULE}; lambda a tenth of the time constant",
+        tuned_by="filter_time_constant",
+        linear=True,
+        spans=plant_scale.dahlin_spans,
+        pictured=True,
+    ),
+    ControllerSpec(
+        name="self-tuning",
+        label="self-tuning",
+        look=("#00B98A", "v"),
+        build=SelfTuningController,
+        prior_knowledge=DATA_SHEET,
+        knows=f"{_DATA_SHEET}; delay range",
         searched="30 settings by hand, not counted; one step test",
     ),
-    Controller(
-        "mpc", "MPC", ("#000000", "*"), PredictiveController, told=EVERYTHING,
-        knows="everything but the future", searched="nothing", swept=False,
+    ControllerSpec(
+        name="mpc",
+        label="MPC",
+        look=("#000000", "*"),
+        build=PredictiveController,
+        prior_knowledge=EVERYTHING,
+        knows="everything but the future",
+        searched="nothing",
+        swept=False,
     ),
-    Controller(
-        "ppo", "PPO", ("#E69F00", "D"), with_policy, told=("parameters", *LIMITS),
-        knows="dead zone", drawn=True,
+    ControllerSpec(
+        name="ppo",
+        label="PPO",
+        look=("#E69F00", "D"),
+        build=with_policy,
+        prior_knowledge=("parameters", *LIMITS),
+        knows="dead zone; trained on a simulator of the paper's plant",
         searched="388 weights on the paper's plant: 5 M samples a policy; settings by 79 "
         "trials: 121 M samples, 30 min",
+        assumes=("direction", "scale"),
         networks=partial(trained, PolicyNetwork, "ppo-[0-9]*.npz"),
+        pictured=True,
     ),
-    Controller(
-        "ppo-hard", "PPO (hard)", ("#8F6200", "D"), with_policy, told=("parameters", *LIMITS),
-        knows="nothing",
+    ControllerSpec(
+        name="ppo-hard",
+        label="PPO (hard)",
+        look=("#8F6200", "D"),
+        build=with_policy,
+        prior_knowledge=("parameters", *LIMITS),
+        knows="limits; trained on a simulator of the plants of `hard`",
         searched="12,608 weights on plants that vary: 4 M samples a policy; settings by 43 "
         "trials: 36 M samples, 12 min",
+        assumes=("direction", "scale"),
+        made_for=PRESETS["hard"],
         networks=partial(trained, PolicyNetwork, "ppo-hard-*.npz"),
     ),
-    Controller(
-        "nn-smith", "neural Smith", ("#0072B2", "^"),
-        NeuralSmithPredictor, told=DATA_SHEET, knows=_DATA_SHEET,
-        searched=f"{_LAW}; one step test", networks=_NETWORK, drawn=True,
+    ControllerSpec(
+        name="neural-smith",
+        label="neural Smith",
+        look=("#0072B2", "^"),
+        build=NeuralSmithPredictor,
+        prior_knowledge=DATA_SHEET,
+        knows=_DATA_SHEET,
+        searched=f"{_LAW}; one step test",
+        networks=_NETWORK,
+        pictured=True,
     ),
-    Controller(
-        "nn-self-tuning", "neural self-tuning", ("#00664B", "v"),
-        NeuralSelfTuningController, told=DATA_SHEET,
+    ControllerSpec(
+        name="neural-self-tuning",
+        label="neural self-tuning",
+        look=("#00664B", "v"),
+        build=NeuralSelfTuningController,
+        prior_knowledge=DATA_SHEET,
         knows=f"{_DATA_SHEET}; delay range",
-        searched=f"{_LAW}; 31 settings by hand; one step test", networks=_NETWORK,
+        searched=f"{_LAW}; 31 settings by hand; one step test",
+        networks=_NETWORK,
     ),
-)}  # fmt: skip
+)
+
+ROSTER = {spec.name: spec for spec in _SPECS}
+"""All controllers by name."""
+
+RENAMED = {
+    "nothing": "idle",
+    "nn-smith": "neural-smith",
+    "nn-self-tuning": "neural-self-tuning",
+}
+"""The names of today of controllers that had another name in earlier versions."""
 
 
 def label(agent: str) -> str:
@@ -250,5 +262,5 @@ def label(agent: str) -> str:
 
 def looks(agents: Sequence[str]) -> dict[str, tuple[str, str]]:
     """Return the colour and the marker of each controller; a user's own take turns."""
-    turns = itertools.cycle(OWN)
+    turns = itertools.cycle(OWN_LOOKS)
     return {agent: ROSTER[agent].look if agent in ROSTER else next(turns) for agent in agents}

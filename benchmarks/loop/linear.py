@@ -1,4 +1,6 @@
-"""Describe the plant as a linear system: its step test and time-varying course.
+"""Describe the plant, and loops around it, as linear systems.
+
+Of the plant: its step test and time-varying course. Of a loop: how robust it is.
 
 Between the limits of the actuator (29) the plant is
 
@@ -8,9 +10,12 @@ where w is the load. Gain and time-constant factors and their drifts are part of
 """
 
 import math
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.polynomial.polynomial import polyadd, polyval
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters
@@ -21,6 +26,9 @@ Array = NDArray[np.float64]
 
 LEVELS = 0.283, 0.632  # of a step response, which time constant and delay are read off
 SLOWEST = 1 - 1e-5  # pole of a plant that settles soon enough for a step test
+FREQUENCIES = np.geomspace(1e-4, math.pi, 400)  # of the sensitivity, rad per sample
+CIRCLE = 1 << 14  # points on the unit circle at which unstable poles are counted
+LONGEST_DELAY = 1000  # samples; the longest for which the stability of a loop is examined
 
 
 class LinearModel:
@@ -138,3 +146,111 @@ def step_test(parameters: Parameters) -> dict[str, float]:
         "delay": delay * interval,
         "sampling_interval": interval,
     }
+
+
+class LinearController(Protocol):
+    """A controller that is linear away from the dead zone and the limits."""
+
+    def transfer(self) -> tuple[Array, Array]:
+        """Return the transfer function from e to u: coefficients of z^0, z^-1 and so on."""
+
+
+@dataclass(frozen=True)
+class LinearLoop:
+    """A linear controller around a plant, away from the dead zone and the limits.
+
+    `controller` and `plant` are transfer functions, from e to u in t/h and from u to y in degC:
+    the coefficients of numerator and denominator, of z^0, z^-1 and so on. That of the plant is
+    B(z^-1) / A(z^-1) of (28). `delay`, d, is in samples.
+    """
+
+    controller: tuple[Array, Array]
+    plant: tuple[Array, Array]
+    delay: int
+
+    @classmethod
+    def of(cls, controller: LinearController, plant: LinearModel) -> "LinearLoop":
+        """Return the loop of a controller and one plant."""
+        numerator = np.append(0.0, plant.beta)
+        denominator = np.append(1.0, -plant.alpha)
+        delay = round(plant.numbers.delay)
+        return cls(controller.transfer(), (numerator, denominator), delay)
+
+    def characteristic(self, delay: int) -> Array:
+        """Return the polynomial in z^-1 whose roots are the inverse poles, with a delay d."""
+        up, down = self.controller
+        b, a = self.plant
+        forward = np.convolve(up, b)
+        late = np.append(np.zeros(delay), forward)
+        return np.asarray(polyadd(np.convolve(down, a), late), np.float64)
+
+    def is_stable(self, delay: int) -> bool:
+        """Return whether all poles lie inside the unit circle, with a delay of d samples.
+
+        By the argument principle, the polynomial in z^-1 turns about 0 once for each pole
+        outside, as z^-1 goes around the unit circle.
+        """
+        values = np.fft.fft(self.characteristic(delay), CIRCLE)
+        if not values.all():  # a pole on the circle
+            return False
+        turns = np.angle(np.roll(values, -1) / values).sum() / (2.0 * math.pi)
+        return bool(round(turns) == 0)
+
+    def sensitivity(self) -> float:
+        """Return Ms, the largest magnitude of 1 / (1 + L); infinite for an unstable loop."""
+        if not self.is_stable(self.delay):
+            return math.inf
+        z = np.exp(-1j * FREQUENCIES)  # z^-1
+        open_loop = np.convolve(self.controller[1], self.plant[1])
+        closed_loop = self.characteristic(self.delay)
+        return float(np.abs(polyval(z, open_loop) / polyval(z, closed_loop)).max())
+
+    def stable_delays(self) -> tuple[int, int] | None:
+        """Return the shortest and longest delay, samples, between which the loop is stable.
+
+        It is stable with all delays between them, of which the plant's is one. None is returned
+        if it is unstable with that one. The longest that is examined is `LONGEST_DELAY`.
+        """
+        if not self.is_stable(self.delay):
+            return None
+        shortest = longest = self.delay
+        while shortest > 0 and self.is_stable(shortest - 1):
+            shortest -= 1
+        while longest < LONGEST_DELAY and self.is_stable(longest + 1):
+            longest += 1
+        return shortest, longest
+
+
+def time_constant_for(
+    target: float,
+    make: Callable[[float], LinearController],
+    plant: LinearModel,
+    slowest: float,
+    fastest: float,
+) -> float:
+    """Return the time constant with which a loop has an Ms of `target`, s.
+
+    `make` returns the controller for a time constant; slower ones make a more robust loop.
+    Down to the one that is returned, all from `slowest` on have at most this Ms. If they all
+    have, it is `fastest`. A ValueError is raised if `slowest` has not.
+    """
+
+    def fits(time_constant: float) -> bool:
+        return LinearLoop.of(make(time_constant), plant).sensitivity() <= target
+
+    grid: list[float] = np.geomspace(slowest, fastest, 24).tolist()
+    first = next((i for i, each in enumerate(grid) if not fits(each)), None)
+    if first is None:
+        return fastest
+    if first == 0:
+        raise ValueError(
+            f"no time constant up to {slowest:g} s gives the loop an Ms of {target:g} or less"
+        )
+    fast, slow = grid[first], grid[first - 1]
+    while slow / fast > 1.0 + 1e-5:
+        middle = math.sqrt(slow * fast)
+        if fits(middle):
+            slow = middle
+        else:
+            fast = middle
+    return slow

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from benchmarks.lib.command import Count, FanOut, Folder, Parameter, command, options
+from benchmarks.lib.errors import UsageError
 from benchmarks.lib.results import KeptResults, conditions_of, results_folder
 from benchmarks.lib.storage import replacing
+from benchmarks.loop.scenarios import PlantOptions
 
 SEED = 10_000  # of the first network; the others follow
 # Modules with the recipes, and how many networks are trained by default.
@@ -30,6 +32,7 @@ class Options:
     networks: Count | None = None
     """Networks to train, each from its own seed (default: 1 for nn-smith, where validation
     chooses the best; 5 for PPO, which are all compared)."""
+    plant: PlantOptions = field(default_factory=PlantOptions)
     steps: Count | None = None
     """Optimiser steps or, for PPO, samples of experience (default: as published)."""
     out: Folder = Path("results/networks")
@@ -38,19 +41,28 @@ class Options:
 
 def work(options: Options) -> str:
     """Train networks, save them and show their results in validation."""
-    name, target = options.network, options.out / options.network
+    name = options.network
     module_name, usual = NETWORKS[name]
     module = importlib.import_module(f"benchmarks.train.{module_name}")
     recipe = module.RECIPES[name]
     recipe = replace(recipe, steps=options.steps or recipe.steps)
     seeds = range(SEED, SEED + (options.networks or usual))
-    tasks = {f"seed {seed}": partial(module.train, recipe, seed) for seed in seeds}
+    train, stem = module.train, name
+    if options.plant.name:
+        if name != "ppo":
+            raise UsageError(f"--plant, --preset and --set are for ppo, not for {name}")
+        plant = options.plant.arguments()
+        recipe = replace(module.for_plant(plant), steps=recipe.steps)
+        train, stem = partial(module.train, plant=plant), f"{name}-plant"
+    tasks = {f"seed {seed}": partial(train, recipe, seed) for seed in seeds}
+    target = options.out / stem
     with results_folder(target, conditions_of("train", options)) as folder:
         kept = KeptResults(folder, save_network, module.load)
         trained = dict(options.fan_out.stream(tasks, "training", kept))
-        files = networks_to_keep(name, {seed: trained[f"seed {seed}"] for seed in seeds})
-        for stem, network in files.items():
-            save_network(folder / f"{stem}.npz", network)
+        networks = {seed: trained[f"seed {seed}"] for seed in seeds}
+        files = networks_to_keep(name, stem, networks)
+        for file_name, network in files.items():
+            save_network(folder / f"{file_name}.npz", network)
     return f"Written to {target}: {', '.join(files)}"
 
 
@@ -60,10 +72,11 @@ def save_network(path: Path, network: Any) -> None:
         network.save(partial_path)
 
 
-def networks_to_keep(name: str, networks: Mapping[int, Any]) -> dict[str, Any]:
+def networks_to_keep(name: str, stem: str, networks: Mapping[int, Any]) -> dict[str, Any]:
     """Show the validation of networks, by seed, and return those to keep, by name of the file.
 
-    Of the networks for a bank of models, this is the best one; of PPO's policies, all.
+    Of the networks for a bank of models, this is the best one; of PPO's policies, all. The
+    names of the files begin with `stem`.
     """
     import pandas as pd
 
@@ -76,7 +89,7 @@ def networks_to_keep(name: str, networks: Mapping[int, Any]) -> dict[str, Any]:
     }
     shown = pd.DataFrame.from_dict(rows, "index").map("{:.4g}".format)
     print(on_screen(shown.reset_index(names="seed")))
-    files = {f"{name}-{seed}": network for seed, network in networks.items()}
+    files = {f"{stem}-{seed}": network for seed, network in networks.items()}
     if name == "nn-smith":
         best = min(rows, key=lambda seed: rows[seed]["all"])
         files = {name: networks[best]}

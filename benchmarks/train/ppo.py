@@ -7,7 +7,7 @@ plants of several kinds, longer memories and the validation.
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
 import gymnasium
@@ -20,9 +20,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
 from agents import Increments, PolicyNetwork
+from benchmarks.controllers.plant_scale import scales
 from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
 from benchmarks.lib.provenance import versions
-from mptc_gym import PRESETS, evaluate
+from mptc_gym import PRESETS, Parameters, evaluate
 from mptc_gym.sb3 import GymnasiumVecEnv
 from mptc_gym.wrappers.vector import IncrementalAction
 
@@ -57,9 +58,17 @@ class Recipe:
         past = {"output_window": self.memory, "action_window": self.memory}
         return {"setpoint_window": 3, "error_window": 1, **past}
 
+    @property
+    def temperature_scale(self) -> float:
+        """Size of the set points, as a multiple of that on the paper's plant."""
+        _, arguments = self.plants[0]
+        scale: float = arguments.get("error_scale", _ERROR_SCALE) / _ERROR_SCALE
+        return scale
 
-# An error scale of 50 degC brings returns to a size of about 1, which are learnt quickly.
-_COST = {"reward": "absolute", "error_scale": 50.0}
+
+# degC; brings returns to a size of about 1, which are learnt quickly.
+_ERROR_SCALE = 50.0
+_COST = {"reward": "absolute", "error_scale": _ERROR_SCALE}
 _RANDOM = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
 _SLOWER = {"setpoint_amplitude": 5.4, "setpoint_period": 500}
 
@@ -86,8 +95,45 @@ RECIPES = {
 }
 
 
-def train(recipe: Recipe, seed: int) -> PolicyNetwork:
-    """Train a policy, and return it with the results of its validation."""
+def for_plant(plant: Mapping[str, Any]) -> Recipe:
+    """Return the recipe of `ppo` for another plant, by arguments of the environment.
+
+    Set points, errors and temperatures scale with `setpoint_amplitude`. A plant without noise
+    has some in most of the training, in proportion to what the flow reaches.
+    """
+    parameters, paper = Parameters(**plant), Parameters()
+    amplitude = parameters.setpoint_amplitude / paper.setpoint_amplitude
+    training = {
+        **plant,
+        "reward": "absolute",
+        "error_scale": _ERROR_SCALE * amplitude,
+        "setpoint": "random",
+        "setpoint_amplitude": 6.0 * amplitude,
+    }
+    noisy = dict(training)
+    if parameters.range_of("noise_variance")[1] == 0.0:
+        reach = "reach of half the flow's range, °C"
+        noisy["noise_variance"] = 0.6 * (scales(parameters)[reach] / scales(paper)[reach]) ** 2
+    validation = {
+        **plant,
+        "setpoint": "square",
+        "setpoint_amplitude": 5.4 * amplitude,
+        "setpoint_period": max(2, 2 * round(parameters.setpoint_period * 500 / 1200)),
+    }
+    (calm, _), (rest, _) = RECIPES["ppo"].plants
+    return replace(
+        RECIPES["ppo"],
+        plants=((calm, training), (rest, noisy)),
+        cases={"plant": validation},
+        dead_zone=sum(parameters.range_of("dead_zone")) / 2.0,
+    )
+
+
+def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> PolicyNetwork:
+    """Train a policy, and return it with the results of its validation.
+
+    `plant` holds the arguments of the plant that a recipe `for_plant` is for.
+    """
     began, model = time.process_time(), begin(recipe, seed)
     model.learn(recipe.steps, callback=Exploration(*recipe.log_std))
     seconds = time.process_time() - began
@@ -105,6 +151,8 @@ def train(recipe: Recipe, seed: int) -> PolicyNetwork:
         "validation": validation,
         "versions": versions(),
     }
+    if plant is not None:
+        policy.provenance["plant"] = dict(plant)
     return policy
 
 
@@ -152,6 +200,7 @@ class Plants(GymnasiumVecEnv):
 def features(recipe: Recipe) -> Array:
     """Return the matrix of an observation's inputs of the networks, (inputs, its size)."""
     one = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
+    one[: -recipe.memory] /= recipe.temperature_scale  # all but the flows are temperatures
     seen = inputs(one, recipe.windows)
     if recipe.levels:  # the set point and the flow
         seen = torch.hstack([seen, 0.2 * one[:, :1], one[:, -recipe.memory, None]])

@@ -1,0 +1,90 @@
+"""Implement a Smith predictor: a PI controller on the error that a model predicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.polynomial import polyadd
+from numpy.typing import NDArray
+
+from agents.controller import Index, Positive, Values
+from agents.internal_model import InternalModelController
+from agents.pi import PIController
+
+Array = NDArray[np.float64]
+
+
+@dataclass(eq=False, kw_only=True)
+class SmithPredictor(InternalModelController):
+    """A PI controller on the error that an undelayed model of the plant predicts.
+
+    A first-order model with a delay runs in parallel with the plant. Its undelayed output minus
+    its delayed output is the effect of the inputs that are still in transit. The controller
+    acts on the error minus this effect. As far as the model is right, it acts as if there were
+    no delay (O. J. M. Smith, "Closer control of loops with dead time", Chemical Engineering
+    Progress 53, 1957, 217-219).
+
+    The gains `kp` and `ki` are SIMC's for the plant without delay. The model is driven by the
+    flow that the actuator passes. A command inside the dead zone is moved to 0 or to the edge
+    of the zone, whichever is nearer. Against windup, the integral follows the wanted flow as
+    far as the limits pass it, with the time constant of the integral action; between the
+    limits, this is the same PI controller (K. J. Astrom and T. Hagglund, "PID Controllers", 2nd
+    edition, 1995, section 3.5). Inside the dead zone it goes on, until the flow passes.
+
+    The other parameters are those of `ModelBasedController`.
+
+    Parameters
+    ----------
+    closed_loop_time_constant
+        Time constant of the closed loop without the delay, s.
+    error_index
+        Index of e(k), degC, in the observation.
+    """
+
+    closed_loop_time_constant: Positive
+    error_index: Index = 3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rule = PIController.simc(
+            gain=self.gain,
+            time_constant=self.time_constant,
+            delay=0.0,
+            closed_loop_time_constant=self.closed_loop_time_constant,
+            sampling_interval=self.sampling_interval,
+        )
+        self.kp = rule.kp  # t/h per degC
+        self.ki = rule.ki  # t/h per degC and sample
+        self.n_obs = self.error_index + 1
+
+    def reset(self) -> None:
+        """Set the integral to zero, and return the model to rest."""
+        super().reset()
+        self._integral: Values = np.float64(0.0)  # -Ki times the sum of past errors, t/h
+
+    def transfer(self) -> tuple[Array, Array]:
+        """Return the transfer function from e to u, valid away from limits and dead zone.
+
+        It is that of the PI controller with the undelayed minus the delayed model fed back
+        around it, in the coefficients of `PIController.transfer`.
+        """
+        pi, integral = PIController(self.kp, self.ki).transfer()
+        model = np.array([0.0, self._input_gain]), np.array([1.0, -self._pole])
+        ahead = np.zeros(self._delay)  # 1 - z^-(delay - 1): inputs in transit
+        ahead[0] += 1.0
+        ahead[-1] -= 1.0
+        outgoing = np.convolve(integral, model[1])
+        returning = np.convolve(np.convolve(pi, model[0]), ahead)
+        return np.convolve(pi, model[1]), polyadd(outgoing, returning)
+
+    def _control(self, rows: Array) -> Array:
+        in_transit = self._undelayed - self._delayed
+        error = rows[:, self.error_index] - in_transit
+        gain = self.kp + self.ki  # the sum includes the present error
+        wanted = self._integral - gain * error
+        within = np.clip(wanted, self.u_min, self.u_max)
+        self._integral = self._integral + self.ki / gain * (within - self._integral)
+        command = self._passable(wanted)
+        self._advance(command)
+        return command

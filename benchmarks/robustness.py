@@ -1,0 +1,187 @@
+"""Compare the linear rules at one robustness: `python -m benchmarks.robustness --help`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.controllers.roster import ROSTER, label
+from benchmarks.controllers.spec import ROBUSTNESS
+from benchmarks.lib.command import FanOut, Folder, Runs, command, options
+from benchmarks.lib.provenance import origin
+from benchmarks.lib.results import results_folder
+from benchmarks.lib.storage import write_csv
+from benchmarks.loop.rollout import is_random, measure
+from benchmarks.loop.scenarios import SCENARIOS, Scenario
+from mptc_gym.evaluation import SEED
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RULES = [name for name, spec in ROSTER.items() if spec.tuned_by]
+CASES = "square", "square-noise", "constant", "load"
+PICTURED = {
+    "square-noise": "square wave with noise, R = 0.5 °C²",
+    "load": "load steps at a held set point",
+}
+SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3
+TEXT = (
+    "Each rule has one number, a time constant, with which its loop has an Ms of "
+    f"{ROBUSTNESS:g} on the paper's plant, away from the dead zone and the limits. The columns "
+    "of the cases are mean errors divided by the lowest achievable error. Stable delays, in "
+    "samples, are those around the plant's 18 with which the loop is stable."
+)
+
+
+@options
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Run PI (SIMC), Smith and Dahlin on the paper's plant along their robustness."""
+
+    runs: Runs = 100
+    """Runs of each rule in each case with noise or load."""
+    fan_out: FanOut = field(default_factory=FanOut)
+    out: Folder = Path("results/robustness")
+
+
+def work(options: Options) -> str:
+    """Run the rules, and write the table, the picture and all numbers."""
+    import pandas as pd
+
+    from benchmarks.lib.report import Section, write_report
+
+    made = origin()
+    bounds: dict[str, Any] = {name: partial(lowest, SCENARIOS[name]) for name in CASES}
+    loops: dict[str, Any] = {
+        f"{name}, Ms {ms:g}": partial(run_rule, name, ms, options.runs)
+        for name in RULES
+        for ms in SENSITIVITIES
+    }
+    results = dict(options.fan_out.stream({**bounds, **loops}, "robustness"))
+    table = pd.DataFrame([row for name in loops for row in results[name]])
+    table["ratio"] = table["mean_error"] / table["case"].map(results)
+    at_one = table[table["Ms"] == ROBUSTNESS]
+    picture = {"robustness.png": "Error over valve travel along the robustness of three rules"}
+    title = f"Three rules at an Ms of {ROBUSTNESS:g}"
+    sections = [Section(title, [TEXT], overview(at_one), picture)]
+    with results_folder(options.out) as folder:
+        write_csv(folder / "robustness.csv", table)
+        draw(table, folder / "robustness.png")
+        write_report(folder, "Rules at one robustness", sections, made)
+    return f"The report, all numbers and the picture are in {options.out}/"
+
+
+def lowest(scenario: Scenario) -> float:
+    """Return the lowest achievable mean error of a case, °C."""
+    from benchmarks.bounds.least import least_possible
+
+    return least_possible(samples=scenario.samples, **scenario.arguments).value
+
+
+def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
+    """Return a row for each case: the results of a rule that is tuned to an Ms."""
+    spec = replace(ROSTER[name], sensitivity=sensitivity)
+    shortest, longest = spec.loop({}).stable_delays() or (None, None)
+    rows = []
+    for case in CASES:
+        scenario = SCENARIOS[case]
+        parameters = scenario.parameters
+        count = runs if is_random(parameters) else 1
+        controller: Any = spec.make(scenario.arguments, count, SEED)
+        trajectory = spec.run(scenario.arguments, scenario.samples, count, SEED, controller)
+        measures = measure(trajectory, parameters)
+        row = {
+            "agent": name,
+            "Ms": sensitivity,
+            spec.tuned_by: spec.robust_time_constant(scenario.arguments),
+            "shortest_delay": shortest,
+            "longest_delay": longest,
+            "case": case,
+            "mean_error": measures["mae"].mean(),
+            "travel": measures["total_variation"].mean(),
+        }
+        rows.append(row)
+    return rows
+
+
+def overview(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of the report: a row for each rule, a column for each case."""
+    import pandas as pd
+
+    lines = []
+    for name in RULES:
+        of_rule = rows[rows["agent"] == name]
+        by_case, first = of_rule.set_index("case"), of_rule.iloc[0]
+        argument = ROSTER[name].tuned_by
+        line = {
+            "controller": label(name),
+            "time constant": f"{argument.replace('_', ' ')} {first[argument]:.3g} s",
+        }
+        for case in CASES:
+            line[case] = f"{float(by_case['ratio'][case]):.3f}"
+        travel = float(by_case["travel"]["square-noise"])
+        line["valve travel in noise (t/h)"] = f"{travel:,.0f}"
+        line["stable delays"] = f"{first['shortest_delay']:g} to {first['longest_delay']:g}"
+        lines.append(line)
+    return pd.DataFrame(lines)
+
+
+def finding(rows: pd.DataFrame) -> str:
+    """Return the title of the picture: what the rules do in noise at one robustness."""
+    noisy = rows[(rows["Ms"] == ROBUSTNESS) & (rows["case"] == "square-noise")]
+    ordered = noisy.sort_values("travel")
+    least, most = ordered.iloc[0], ordered.iloc[-1]
+    share = 100.0 * least["travel"] / most["travel"]
+    return (
+        f"At an Ms of {ROBUSTNESS:g}, {label(least['agent'])}'s valve travels {share:.0f} % as "
+        f"far in noise as {label(most['agent'])}'s, with {least['ratio']:.3f} against "
+        f"{most['ratio']:.3f} times the lowest achievable error"
+    )
+
+
+def draw(rows: pd.DataFrame, path: Path) -> None:
+    """Draw error over valve travel, a panel for each case of `PICTURED`."""
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import MaxNLocator, NullLocator
+
+    from benchmarks.lib.report import panels
+
+    with panels(path, [*PICTURED.values()], 3.1, 2, finding(rows)) as (figure, axes):
+        for panel, case in zip(axes, PICTURED, strict=True):
+            of_case = rows[rows["case"] == case]
+            for name in RULES:
+                _draw_rule(panel, of_case[of_case["agent"] == name], name)
+            panel.set_xlabel("valve travel in a run (t/h)")
+            panel.yaxis.set_major_locator(MaxNLocator(5))
+        axes[0].set_xscale("log")
+        ticks = [200, 500, 1000, 2000, 5000]
+        axes[0].set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+        axes[0].xaxis.set_minor_locator(NullLocator())
+        axes[0].set_ylabel("mean error / lowest achievable")
+        handles, names = axes[0].get_legend_handles_labels()
+        large: Any = {"marker": "o", "markersize": 9, "markeredgecolor": "k", "linestyle": ""}
+        handles.append(Line2D([], [], color="0.8", **large))
+        names.append(f"Ms {ROBUSTNESS:g}; numbers: Ms of the ends")
+        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+
+
+def _draw_rule(panel: Any, rows: pd.DataFrame, name: str) -> None:
+    """Draw the line of a rule: with Ms at its ends, and the Ms of the table emphasised."""
+    colour, marker = ROSTER[name].look
+    style: Any = {"color": colour, "marker": marker}
+    panel.plot(rows["travel"], rows["ratio"], **style, markersize=4, label=label(name))
+    compared = rows[rows["Ms"] == ROBUSTNESS]
+    panel.plot(compared["travel"], compared["ratio"], **style, ms=10, mec="k")
+    for i in (0, -1):
+        end = rows.iloc[i]
+        offset: Any = {"xytext": (5, 4), "textcoords": "offset points"}
+        place = end["travel"], end["ratio"]
+        panel.annotate(f"{end['Ms']:g}", place, color=colour, fontsize=8, **offset)
+
+
+main = command("robustness", Options, work)
+
+if __name__ == "__main__":
+    raise SystemExit(main(None))
