@@ -81,7 +81,7 @@ REFUSED = {
     "sweep": [
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
         (["--plants", "10"], "--plants and --design-seed are for --design random"),
-        (["--out", __file__], "cannot be written to: File exists"),
+        (["--out", __file__], "cannot be written to: it is a file"),
     ],
     "train": [(["pi"], '"pi" for NETWORK. Choose from: "nn-smith", "ppo"')],
     "watch": [
