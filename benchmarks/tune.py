@@ -23,6 +23,7 @@ from benchmarks.lib.command import (
 )
 from benchmarks.lib.provenance import origin
 from benchmarks.lib.results import KeptResults, conditions_of, results_folder
+from benchmarks.lib.seeds import SEEDS
 from benchmarks.lib.storage import write_csv, write_json
 from benchmarks.loop.rollout import mean_error, settled
 from benchmarks.loop.scenarios import Arguments, PlantOptions
@@ -31,11 +32,12 @@ from mptc_gym import Parameters
 if TYPE_CHECKING:
     import pandas as pd
 
-SEED = 1_000_000  # of the search
+SEED = SEEDS["sampler"].first
 STARTUP = 200  # trials at random before the sampler learns
-FIRST_RUN = 3_000_000  # first seed of the runs; no comparison uses these seeds
+FIRST_RUN = SEEDS["preparation"].first  # of the trials
 FINALISTS = 10  # of the best trials, which are judged again
-FINAL_RUNS, FINAL_FIRST_RUN = 1000, 4_000_000  # for that
+FINAL_RUNS = 1000  # for that
+FINAL_FIRST_RUN = SEEDS["finals"].first
 PENALTY = 5.0  # degC, for failing to settle: the cost of doing nothing about an error of 5 degC
 TUNED = [name for name, spec in ROSTER.items() if spec.spans]
 NOTE = (

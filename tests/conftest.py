@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 # Before NumPy and PyTorch are loaded: the processes of the tests share the cores already.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 os.environ["SDL_VIDEODRIVER"] = "dummy"  # windows that nobody sees
 
 import gymnasium

@@ -14,12 +14,22 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from mptc_gym import PRESETS, MiddlePointEnv, Parameters
+from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv, Parameters
 from mptc_gym.evaluation import WINDOWS
-from mptc_gym.parameters import argument_table
+from mptc_gym.parameters import PLANT_NUMBERS, argument_table
 from tests.conftest import ROOT, run, valid_arguments
 
 INFO = {"output", "setpoint", "error", "command", "applied", "noise"}
+
+
+@pytest.mark.parametrize("kind", [MiddlePointEnv, MiddlePointVectorEnv])
+def test_help_shows_which_arguments_may_be_ranges(kind):
+    shown = inspect.signature(kind).parameters
+    types = {name: shown[name].annotation for name in PLANT_NUMBERS}
+    assert set(types.values()) == {"float | Sequence[float]"}
+    assert shown["setpoint_period"].annotation == "int"
+    assert shown["temperature_span"].annotation == "float"
+    assert shown["reward"].annotation == "str"
 
 
 @pytest.mark.parametrize("library", ["gymnasium.utils", "stable_baselines3.common"])

@@ -3,11 +3,16 @@
 import os
 import secrets
 import signal
+import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
+from unittest.mock import Mock
 
+import joblib
 import numpy as np
 import pytest
 
@@ -112,3 +117,64 @@ def test_where_there_is_no_cluster_it_says_so(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "nowhere")  # "auto" would find those of other users
     with pytest.raises(UsageError, match="--backend: no Ray cluster can be reached: start one"):
         dict(FanOut(backend="ray").stream(work(1)))
+
+
+def test_tasks_can_be_run_from_a_thread():
+    before = signal.getsignal(signal.SIGINT)
+    with ThreadPoolExecutor() as threads:
+        results = threads.submit(run, work(3)).result()
+    assert results == {f"plant {seed}": draw(seed) for seed in range(3)}
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_error_of_joblib_leaves_the_signals_as_they_were(monkeypatch):
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(joblib.Parallel, "__call__", Mock(side_effect=OSError("no semaphores")))
+    with pytest.raises(OSError, match="no semaphores"):
+        run(work(3))
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+ORPHANS = """
+import os, pathlib, sys, time
+from functools import partial
+from benchmarks.lib.command import FanOut
+
+def wait(folder):
+    (folder / str(os.getpid())).touch()
+    time.sleep(120)
+
+folder = pathlib.Path(sys.argv[1])
+dict(FanOut(jobs=2).stream({name: partial(wait, folder) for name in "ab"}))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_processes_end_when_the_one_that_started_them_is_killed(tmp_path):
+    parent = subprocess.Popen([sys.executable, "-c", ORPHANS, tmp_path], cwd=ROOT)
+
+    def begun():
+        return [path.name for path in tmp_path.iterdir()]
+
+    assert wait_until(lambda: len(begun()) == 2)
+    parent.kill()
+    parent.wait()
+    assert wait_until(lambda: not any(is_running(number) for number in begun()), seconds=15)
+
+
+def wait_until(condition, seconds=60):
+    """Return whether a condition comes true in time."""
+    for _ in range(10 * seconds):
+        if condition():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def is_running(process):
+    """Return whether a process runs; one that ended may wait for its parent to ask for it."""
+    try:
+        status = Path("/proc", process, "stat").read_text()
+    except OSError:
+        return False
+    return status.rpartition(")")[2].split()[0] != "Z"

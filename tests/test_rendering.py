@@ -93,6 +93,32 @@ def test_what_is_written(monkeypatch):
         assert place.collidelist(places[:i]) == -1
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [
+        (-10.0, 10.0, [-10.0, -5.0, 0.0, 5.0, 10.0]),
+        (0.0, 6.0, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
+        (0.5, 12.5, [2.0, 4.0, 6.0, 8.0, 10.0, 12.0]),
+        (0.0, 60.0, [0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0]),
+        (0.0, 0.7, [0.0, 0.2, 0.4, 0.6]),
+    ],
+)
+def test_numbers_at_an_axis_are_round_and_few(low, high, ticks):
+    assert drawing.ticks(low, high) == pytest.approx(ticks)
+
+
+def test_a_large_value_is_written_in_few_digits(monkeypatch):
+    write = Mock(return_value=pygame.Rect(0, 0, 1, 1))
+    monkeypatch.setattr(drawing.Panel, "write", write)
+    drawing.draw(record((99999.0, -100000.0, 0.0, 0.0), (1e9, -1e9, -0.001, 0.0)))
+    texts = {each.args[0].strip() for each in write.mock_calls}
+    assert {"temperature -1e+09 °C", "set point 1e+09 °C", "command 0.00 t/h"} <= texts
+    write.reset_mock()
+    drawing.draw(record((99999.0, -100000.0, 0.0, 0.0)))
+    texts = {each.args[0].strip() for each in write.mock_calls}
+    assert {"set point 99999.00 °C", "temperature -1e+05 °C"} <= texts
+
+
 def test_frames_stay_and_copies_in_the_middle_of_an_episode_draw_alike():
     env = MiddlePointEnv(render_mode="rgb_array", **NOISY)
     env.reset(seed=0)

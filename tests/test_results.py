@@ -121,10 +121,11 @@ class TestFolder:
         assert contents(target) == {"report.md": "old", "old.csv": "1"}
 
     @pytest.mark.parametrize(
-        ("folder", "reason"), [("/proc/here/toy", "cannot be written to: "), ("/", "no folder")]
+        ("folder", "reason"),
+        [("/proc/here/toy", "/proc/here cannot be"), ("/", "/ is no folder")],
     )
     def test_a_folder_that_cannot_be_written_to_is_refused(self, folder, reason):
-        with pytest.raises(UsageError, match=f"--out: {folder} .*{reason}"):
+        with pytest.raises(UsageError, match=f"--out: {reason}"):
             run(Path(folder), {})
 
 

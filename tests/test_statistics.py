@@ -18,6 +18,13 @@ def test_median_by_hand():
     assert vars(estimate) == {"value": 5.5, "low": 2, "high": 9, "runs": 10}
 
 
+def test_an_interval_is_no_narrower_than_95_percent_asks():
+    # Of 14 values, the 4th and the 11th enclose the median with 94.3 % alone: outside of them
+    # lie 2 (1 + 14 + 91 + 364) / 2^14 = 5.7 %.
+    estimate = quantile(np.arange(1.0, 15.0), 0.5)
+    assert (estimate.low, estimate.high) == (3.0, 12.0)
+
+
 def test_quantile_of_some_that_never_end():
     values = np.r_[np.arange(1.0, 91.0), [math.inf] * 10]
     assert quantile(values, 0.5).value == 51  # the next higher of 50 and 51, not between

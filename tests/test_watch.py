@@ -66,9 +66,7 @@ def test_a_film_shows_steps_side_by_side(given, plant, steps, written, tmp_path,
     assert f"PI (1992): error {found} times that of" in capsys.readouterr().out
 
 
-def test_a_film_stays_in_its_folder_whatever_the_name_of_the_controller(
-    tmp_path, monkeypatch
-):
+def test_a_film_stays_in_its_folder_whatever_the_name_of_the_controller(tmp_path, monkeypatch):
     (tmp_path / "a/b").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "a/b")
     assert main(["--agent", "../../$x=agents:PIController", "--scenario", "constant"]) == 0

@@ -1,9 +1,9 @@
 """Declare and run the commands `python -m benchmarks.NAME`, and their tasks in parallel.
 
 A command is a file, `benchmarks/NAME.py`, or a folder with a `__main__.py`. It has a dataclass
-of `options`, whose docstrings are the help, and a function `work` of these. This prints what it
-finds, returns the closing line, and imports what is slow to import. The last line calls
-`main = command("NAME", Options, work)`.
+of options, whose docstrings are the help, and a function `work` that takes these options. The
+function prints its results, returns the closing line, and imports what is slow to import.
+`main = command("NAME", Options, work)` makes the command of the two.
 """
 
 import errno
@@ -43,14 +43,15 @@ def stop(error: BaseException, program: str = "python -m benchmarks") -> NoRetur
     If a package is missing, the sentence names the extra that installs it. An import that fails
     for another reason is a bug, and is raised.
     """
-    said, cause = str(error), error.__cause__ or error
+    message = str(error)
+    cause = error.__cause__ or error
     name = str(getattr(cause, "name", "")).partition(".")[0]
     extras = [extra for extra, packages in EXTRAS.items() if name in packages.split()]
     if extras:
-        said = f'{name} is not installed: pip install -e ".[{extras[0]}]" ({cause})'
+        message = f'{name} is not installed: pip install -e ".[{extras[0]}]" ({cause})'
     elif isinstance(error, ImportError):
         raise error
-    print(f"{program}: error: {said}", file=sys.stderr)
+    print(f"{program}: error: {message}", file=sys.stderr)
     raise SystemExit(2) from error
 
 
@@ -99,12 +100,12 @@ def blame(option: str) -> Iterator[None]:
         raise UsageError(f"{option}: {error}") from error
 
 
-def known(option: str, given: Sequence[str], names: Collection[str]) -> list[str]:
+def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[str]:
     """Return the names that an option lists, each once; `UsageError` if one is not known."""
-    for name in given:
+    for name in listed:
         if name not in names:
             raise UsageError(f"{option}: no {name!r}; there are {', '.join(names)}")
-    return list(dict.fromkeys(given))
+    return list(dict.fromkeys(listed))
 
 
 def _typed(default: object) -> str | None:
@@ -114,7 +115,7 @@ def _typed(default: object) -> str | None:
     return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
 
 
-def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | None:
+def read(declared: type[Group], program: str, words: Sequence[str]) -> Group | None:
     """Read a command line into options; with --help, print the help and return None.
 
     An invalid option is a `UsageError`.
@@ -129,10 +130,10 @@ def read(declared: type[Group], program: str, given: Sequence[str]) -> Group | N
     app["--help"].show = False
     app.default(declared)
     try:
-        found = app(list(given), exit_on_error=False, print_error=False)
+        chosen = app(list(words), exit_on_error=False, print_error=False)
     except CycloptsError as error:
         raise UsageError(" ".join(str(error).split())) from error
-    return found if isinstance(found, declared) else None
+    return chosen if isinstance(chosen, declared) else None
 
 
 def command(
@@ -146,8 +147,8 @@ def command(
     program = f"python -m benchmarks.{name}"
 
     def main(arguments: Sequence[str] | None = None) -> int:
-        given = sys.argv[1:] if arguments is None else arguments
-        typed = COMMAND_LINE.set(shlex.join(["python", "-m", f"benchmarks.{name}", *given]))
+        words = sys.argv[1:] if arguments is None else arguments
+        token = COMMAND_LINE.set(shlex.join(["python", "-m", f"benchmarks.{name}", *words]))
         os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever the shell has set
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):
@@ -157,7 +158,7 @@ def command(
                 signal.signal(number, _interrupt)
 
         def read_and_work() -> str:
-            chosen = read(declared, program, given)
+            chosen = read(declared, program, words)
             closing_line = "" if chosen is None else work(chosen)
             if arguments is None:  # the process ends: nothing is left to be interrupted
                 _ignore_signals()
@@ -166,7 +167,7 @@ def command(
         try:
             return finish(read_and_work, program)
         finally:
-            COMMAND_LINE.reset(typed)
+            COMMAND_LINE.reset(token)
 
     return main
 
@@ -179,8 +180,8 @@ def finish(work: Callable[[], str], program: str) -> int:
     with 2.
     """
     try:
-        if said := work():
-            print(said, flush=True)
+        if closing_line := work():
+            print(closing_line, flush=True)
     except KeyboardInterrupt as stopped:
         print("\nInterrupted.", flush=True)
         return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
@@ -253,11 +254,7 @@ class FanOut:
                     kept.save(name, result)
                 yield name, result
         if errors:
-            said = f"{len(errors)} of {len(tasks)} tasks failed; the others are done"
-            # Each kind of error once, and the first with its traceback.
-            kinds = {text.splitlines()[-1]: name for name, text in reversed(errors.items())}
-            shown = [f"{name}: {last}" for last, name in kinds.items()]
-            raise UnfinishedError("\n".join([said, *shown[:20], next(iter(errors.values()))]))
+            raise UnfinishedError(_summary(errors, len(tasks)))
 
     def _answers(self, tasks: Mapping[str, Task]) -> Iterator[Answer]:
         """Run tasks, and yield each answer as it comes."""
@@ -283,6 +280,17 @@ class FanOut:
             raise UnfinishedError(
                 "a process was killed, perhaps for lack of memory: try fewer --jobs"
             ) from error
+
+
+def _summary(errors: Mapping[str, str], tasks: int) -> str:
+    """Return a text about errors, by task: each kind once, and the first with its traceback."""
+    summary = [f"{len(errors)} of {tasks} tasks failed; the others are done"]
+    first_of_kind: dict[str, str] = {}
+    for name, text in errors.items():
+        first_of_kind.setdefault(text.splitlines()[-1], name)
+    for last_line, name in list(first_of_kind.items())[:20]:
+        summary.append(f"{name}: {last_line}")
+    return "\n".join([*summary, next(iter(errors.values()))])
 
 
 @contextmanager

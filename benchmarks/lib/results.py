@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.lib.errors import UnfinishedError, UsageError
 from benchmarks.lib.provenance import COMMAND_LINE, code_hash, versions
-from benchmarks.lib.storage import replacing, write_json
+from benchmarks.lib.storage import out_folder, replacing, write_json
 
 RECORD = "run.json"  # in each folder: what the run depends on, and the files that it wrote
 TASKS = "tasks"  # folder of the results that an unfinished run keeps
@@ -82,9 +82,9 @@ def _locked(target: Path, place: Path) -> Iterator[None]:
 
     if place.exists() and not place.is_dir():
         raise UsageError(f"--out: {target} cannot be written to: it is a file")
+    out_folder(place.parent)
     lock = FileLock(place.with_name(f".{place.name}.lock"))
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
     except Timeout as error:
         raise UsageError(

@@ -10,10 +10,11 @@ from typing import Annotated, Any
 from benchmarks.lib.command import Count, FanOut, Folder, Parameter, command, options
 from benchmarks.lib.errors import UsageError
 from benchmarks.lib.results import KeptResults, conditions_of, results_folder
+from benchmarks.lib.seeds import SEEDS
 from benchmarks.lib.storage import replacing
 from benchmarks.loop.scenarios import PlantOptions
 
-SEED = 10_000  # of the first network; the others follow
+SEED = SEEDS["networks"].first  # of the first network; the others follow
 # Modules with the recipes, and how many networks are trained by default.
 NETWORKS = {"nn-smith": ("through_plant", 1), "ppo": ("ppo", 5), "ppo-hard": ("ppo", 5)}
 

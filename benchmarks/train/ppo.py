@@ -23,7 +23,9 @@ from agents import Increments, PolicyNetwork
 from benchmarks.controllers.plant_scale import scales
 from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
 from benchmarks.lib.provenance import versions
+from benchmarks.lib.seeds import SEEDS
 from mptc_gym import PRESETS, Parameters, evaluate
+from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.sb3 import GymnasiumVecEnv
 from mptc_gym.wrappers.vector import IncrementalAction
 
@@ -31,8 +33,7 @@ Array = NDArray[np.float64]
 
 load = PolicyNetwork.load
 
-TRAINING_SEEDS = 1 << 32  # seeds from here on are those of the training plants alone
-VALIDATION_SEED = 9_000_000  # no published result uses the seeds from here on
+TRAINING_SEEDS = SEEDS["training"].first  # of the training plants
 MAX_MOVE = 2.0  # change of the flow at an action of 1, as a share of half its range
 
 

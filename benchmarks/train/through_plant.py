@@ -18,10 +18,12 @@ from torch import Tensor, nn
 
 from agents.neural_law import INPUTS, MOST_ADDED, OUTPUTS, LawNetwork
 from benchmarks.lib.provenance import versions
+from benchmarks.lib.seeds import SEEDS
 from benchmarks.train.loops import Draw, Loops, environment
 
 load = LawNetwork.load
-VALIDATION_PLANTS, VALIDATION_SAMPLES, VALIDATION_SEED = 64, 600, 3_000_000
+VALIDATION_PLANTS, VALIDATION_SAMPLES = 64, 600
+VALIDATION_SEED = SEEDS["preparation"].first
 # Kinds of validation plants, with the ranges drawn from: low, high, and the power of `small`.
 # They do not occur in training, and their models are exact.
 KINDS: dict[str, dict[str, tuple[float, float, int]]] = {

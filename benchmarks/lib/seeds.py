@@ -1,0 +1,43 @@
+"""The table of seeds: each purpose has a block of its own.
+
+An episode of the environment follows from its seed. So results on one block say nothing about
+another block, and what was chosen on one is measured on another. Bootstraps and designs of
+plants have generators of their own, with seeds from 0 on, which draw no episode.
+"""
+
+from dataclasses import dataclass
+
+from mptc_gym import evaluation
+
+
+@dataclass(frozen=True)
+class Block:
+    """Seeds that follow each other, from `first` on."""
+
+    first: int
+    count: int
+    purpose: str
+
+    @property
+    def seeds(self) -> range:
+        """All seeds of the block."""
+        return range(self.first, self.first + self.count)
+
+
+SEEDS = {
+    "studies": Block(0, 10_000, "runs of sweeps, claims and films, which are only measured"),
+    "networks": Block(10_000, 1_000, "initial weights of networks, and their training"),
+    "sampler": Block(1_000_000, 100_000, "gains that a search tries"),
+    "preparation": Block(
+        3_000_000, 500_000, "trials of a search, and runs in which a controller learns before"
+    ),
+    "finals": Block(4_000_000, 500_000, "runs that choose among the best trials of a search"),
+    "validation": Block(
+        evaluation.VALIDATION_SEED,
+        evaluation.VALIDATION_EPISODES,
+        "episodes to choose policies by, with bounds in the package",
+    ),
+    "published": Block(evaluation.SEED, 100_000, "episodes of published results"),
+    "data sets": Block(9_000_000, 100_000, "episodes that data sets hold"),
+    "training": Block(1 << 32, 1 << 32, "episodes of the plants that policies are trained on"),
+}

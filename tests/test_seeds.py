@@ -1,0 +1,92 @@
+"""Every seed of the project is one of the table, and no two purposes share one."""
+
+import ast
+import itertools
+import json
+import re
+
+import pytest
+
+from benchmarks import datasets, sweep, tune, watch
+from benchmarks.claims.runs import Batch
+from benchmarks.controllers import roster
+from benchmarks.lib.seeds import SEEDS
+from benchmarks.train import __main__ as train
+from mptc_gym import evaluation
+from tests.conftest import ROOT
+
+TABLE = ROOT / "benchmarks/lib/seeds.py"
+PAGES = [ROOT / "README.md", *ROOT.glob("*/**/*.md")]
+
+
+def block_of(seed):
+    """Return the name of the block that holds a seed."""
+    (name,) = [name for name, block in SEEDS.items() if seed in block.seeds]
+    return name
+
+
+def test_no_two_blocks_share_a_seed():
+    blocks = sorted(SEEDS.values(), key=lambda block: block.first)
+    for block, later in itertools.pairwise(blocks):
+        assert block.seeds.stop <= later.first, (block, later)
+
+
+def test_every_command_stays_in_its_block():
+    trials = [tune.FIRST_RUN + i * 100_000 for i in range(len(tune.CASES))]
+    finals = [seed - tune.FIRST_RUN + tune.FINAL_FIRST_RUN for seed in trials]
+    for name, seeds in {
+        "studies": [sweep.SEED, Batch(1000).seed + 1000 - 1, watch.Options().seed],
+        "networks": [train.SEED, train.SEED + 5 - 1],
+        "sampler": [tune.SEED, tune.SEED + 800 - 1],
+        "preparation": [*trials, trials[-1] + 100 - 1, roster.COMMISSIONING_SEED + 1000 - 1],
+        "finals": [*finals, finals[-1] + tune.FINAL_RUNS - 1],
+        "validation": [evaluation.VALIDATION_SEED],
+        "published": [evaluation.SEED, evaluation.SEED + 1000 - 1],
+        "data sets": [datasets.SEED, datasets.SEED + datasets.EPISODES - 1],
+    }.items():
+        assert {block_of(seed) for seed in seeds} == {name}
+
+
+def test_policies_are_chosen_and_trained_where_nothing_is_published():
+    ppo = pytest.importorskip("benchmarks.train.ppo", reason="PPO needs an extra")
+    assert block_of(ppo.VALIDATION_SEED + evaluation.EPISODES - 1) == "validation"
+    assert block_of(ppo.TRAINING_SEEDS + (1 << 32) - 1) == "training"
+
+
+def test_no_other_file_has_a_first_seed_of_its_own():
+    elsewhere = {*ROOT.glob("*/**/*.py")} - {TABLE, ROOT / "mptc_gym/evaluation.py"}
+    for path in elsewhere:
+        if path.relative_to(ROOT).parts[0] not in ("agents", "benchmarks", "mptc_gym"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Assign) and re.search(
+                "SEED|RUN", ast.unparse(node.targets)
+            ):
+                values = [
+                    leaf.value for leaf in ast.walk(node) if isinstance(leaf, ast.Constant)
+                ]
+                assert not [n for n in values if isinstance(n, int) and n >= 10_000], path
+
+
+def test_pages_name_seeds_of_the_table():
+    sentences = [
+        words
+        for page in PAGES
+        for words in re.findall(r"seeds?\b[^.\n|]*", page.read_text("utf-8"))
+    ]
+    named = re.findall(r"\d{1,3}(?:,\d{3}){2,}", " ".join(sentences))
+    assert {block_of(int(seed.replace(",", ""))) for seed in named} == {"published"}
+
+
+def test_published_files_have_the_seeds_of_the_table():
+    read = lambda path: json.loads((ROOT / path).read_text("utf-8"))  # noqa: E731
+    seeds = read("benchmarks/published/provenance.json")["seeds"]
+    assert {block_of(seed) for seed in seeds} == {"published"}
+    bounds = read("mptc_gym/bounds.json")
+    assert block_of(bounds["seed"] + bounds["episodes"] - 1) == "published"
+
+
+@pytest.mark.parametrize("controller", ["ppo", "ppo-hard"])
+def test_trained_networks_have_the_seeds_of_the_table(controller):
+    for member in roster.ROSTER[controller].members():
+        assert block_of(member.provenance["seed"]) == "networks"
