@@ -1,6 +1,7 @@
 """Search for a controller's gains with Optuna: `python -m benchmarks.tune --help`."""
 
 import math
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -121,16 +122,17 @@ def work(options: Options) -> str:
         "controller": name,
         "gains": table.loc[0, names].to_dict(),
         "plant": plant,
-        "knows": f"gains of a search on {options.plant.name or 'the paper plant'}",
+        "knows": "gains of a search on this plant",
         "searched": f"{len(names)} gains by {budget}",
     }
     write_json(out / "gains.json", content)
     title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS} new runs"
     sections = [Section(title, [NOTE], table.map("{:.4g}".format))]
     write_report(out, f"Gains: {spec.label}", sections, "tune", made)
+    words = [*options.plant.words(), "--agent", f"my-{name}={out}/gains.json"]
     return (
         f"All trials are in {out}/trials.csv, the best in {out}/report.md. To compare them: "
-        f"python -m benchmarks.compare --agent my-{name}={out}/gains.json"
+        f"python -m benchmarks.compare {shlex.join(words)}"
     )
 
 
