@@ -1,9 +1,9 @@
 """Search for a controller's gains with Optuna: `python -m benchmarks.tune --help`."""
 
 import math
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -117,16 +117,17 @@ def work(options: Options) -> str:
             "controller": name,
             "gains": table.loc[0, names].to_dict(),
             "plant": plant,
-            "knows": f"gains of a search on {options.plant.name or 'the paper plant'}",
+            "knows": "gains of a search on this plant",
             "searched": f"{len(names)} gains by {budget}",
         }
         write_json(folder / "gains.json", content)
         title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS} new runs"
         sections = [Section(title, [NOTE], table.map("{:.4g}".format))]
         write_report(folder, f"Gains: {ROSTER[name].label}", sections, made)
+    words = [*options.plant.words(), "--agent", f"my-{name}={target}/gains.json"]
     return (
         f"All trials are in {target}/trials.csv, the best in {target}/report.md. To compare "
-        f"them: python -m benchmarks.compare --agent my-{name}={target}/gains.json"
+        f"them: python -m benchmarks.compare {shlex.join(words)}"
     )
 
 

@@ -33,6 +33,9 @@ from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from tests.conftest import ROOT, trajectory
 
+# A plant whose temperature rises with the flow, with a time constant of 20 s.
+RISING = {"a": [1.0, -0.67032], "b": [0.13187], "c": [1.0], "delay": 4, "dead_zone": 1.5}
+RISING |= {"u_min": -20.0, "u_max": 30.0}
 GOLDEN = Path(__file__).parent / "golden"  # numbers of earlier versions
 
 
@@ -285,7 +288,7 @@ class TestCompare:
             assert f"{error / limit:.2f}" in shown
         # The best comes first.
         assert page.index("| MPC") < page.index("| NN (1992)") < page.index("| PI (1992)")
-        assert "6 gains by 800 trials: 566 M samples" in page
+        assert "6 gains by the search of version 0.1" in page
         provenance = json.loads((out / "provenance.json").read_text())
         assert "missing" not in provenance
         assert provenance["seeds"] == [SEED, SEED + 1, SEED + 2]
@@ -394,3 +397,43 @@ class TestCompare:
         assert main(given.split()) == 0
         folder = tmp_path / "results/compare-plant"
         assert pd.read_csv(folder / "runs.csv")["saturation_share"].isna().all()
+
+    @pytest.mark.usefixtures("undrawn")
+    def test_controllers_made_for_another_plant_are_marked_and_not_ranked(
+        self, compared, tmp_path, capsys
+    ):
+        plant = tmp_path / "plant.json"
+        plant.write_text(json.dumps(RISING))
+        agents = "pi pi-simc dahlin ppo nn idle"
+        out = compared(f"--plant {plant} --scenarios square --agents {agents} --runs 1")
+        page, screen = (out / "report.md").read_text(), capsys.readouterr().out
+        for text in (page, screen):
+            assert "PI (1992) was made for a plant of negative gain" in text
+            assert "so the loop runs in positive feedback" in text
+            # NN (1992) knows the direction, but its gains are for a plant eight times as slow.
+            assert "NN (1992) was made for another plant: the time constant is 2.5" in text
+        rows = [line.split("|")[1:3] for line in page.splitlines() if line.startswith("| ")]
+        scores = {name.strip(): score.strip() for name, score in reversed(rows)}
+        for name in ("PI (1992) †", "PPO †", "NN (1992) †"):
+            assert scores[name] == "not ranked"
+        for name in ("PI (SIMC)", "Dahlin"):
+            assert float(scores[name]) > 0.9
+        assert scores["idle valve"] == "0.000"
+        # They stand below the worst that counts, though not all of them are worse.
+        assert page.index("| idle valve") < page.index("| NN (1992) †")
+
+    def test_on_the_plants_that_it_was_made_for_nobody_is_marked(self):
+        for preset in PRESETS.values():
+            plant = Parameters(**preset)
+            assert comparison.misfits_of(ROSTER, [plant]) == {}
+        slow = Parameters(delay=40)  # 41 samples in place of 19
+        assert set(comparison.misfits_of(ROSTER, [slow])) == {
+            "nn", "nn-frozen", "pi", "pi-searched", "ppo", "ppo-hard",
+        }  # fmt: skip
+
+    def test_the_costs_have_the_robustness_of_the_linear_controllers(self):
+        specs = {name: ROSTER[name] for name in ("pi", "pi-simc", "smith", "dahlin", "mpc")}
+        table = comparison.costs_table([], specs, SCENARIOS["square"])
+        assert table["Ms"].tolist() == ["unstable", "1.60", "1.60", "1.60", ""]
+        delays = table["stable with delays of (samples)"].tolist()
+        assert delays == ["none around the plant's", "0 to 56", "0 to 52", "0 to 54", ""]

@@ -25,8 +25,6 @@ ACTUATOR = {"u_min": -9.0, "u_max": 14.0, "dead_zone": 4.0}
 # A plant of the other direction, which shows an input sooner.
 OTHER = {**ACTUATOR, "b": [0.0456, 0.00404], "delay": 9}
 IDLE = 5.0  # mean |e| of a valve that is left alone, degC
-# Those that are made for the paper's plant, and told no more than the actuator.
-UNTOLD = ("pi", "pi-searched", "ppo", "ppo-hard")
 
 
 @pytest.fixture(params=ROSTER)
@@ -42,7 +40,7 @@ def member(entry):
 def test_it_is_told_the_plant_that_it_is_made_for(entry, member):
     assert entry.knows
     assert entry.searched
-    plant = ACTUATOR if entry.name in UNTOLD else OTHER
+    plant = ACTUATOR if "direction" in entry.assumes else OTHER
     found = run_case(Scenario("other", "", 600, plant), member, 2).runs["mae"].to_numpy()
     if entry.name == "idle":
         np.testing.assert_allclose(found, IDLE)
@@ -71,8 +69,8 @@ def test_a_batch_is_its_members_again_and_mirrored(entry, member):
     # An episode leaves nothing behind but what is learnt.
     again = run(3, 5, controller=controller)[1]
     assert np.array_equal(again.command, batch.command) is not member.learns
-    # Policies trained on the paper's plant are not told another; initial weights are random.
-    if entry.name in UNTOLD or entry.random:
+    # Some were made for plants of one direction; initial weights are random.
+    if "direction" in entry.assumes or entry.random:
         return
     _, mirrored = run(3, 5, sign=-1.0)
     # Actions have 24 bits, which limits the agreement.

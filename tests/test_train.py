@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 
 from agents import LawNetwork, NeuralSmithPredictor, PolicyNetwork
 from agents.networks import PRETRAINED
+from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.examples import sb3
 from benchmarks.loop.rollout import make_plants, rollout
@@ -266,3 +267,39 @@ def test_those_of_the_project_are_of_the_recipes_and_the_search_is_that_of_its_l
         count = sum(W.size for W, _ in network.layers)
         assert f"{count:,} weights" in each.searched
         assert f": {recipe.steps / 1e6:g} M samples a policy" in each.searched
+
+
+class TestOtherPlants:
+    PLANT = {"b": [0.0456, 0.00404], "setpoint_amplitude": 10.0, "dead_zone": 2.0}  # noqa: RUF012
+
+    def test_the_recipe_is_that_of_the_paper_plant_scaled(self):
+        recipe, paper = ppo.for_plant(self.PLANT), ppo.for_plant({})
+        assert [count for count, _ in recipe.plants] == [152, 360]
+        for _, arguments in recipe.plants:
+            assert arguments["b"] == self.PLANT["b"]
+            assert (arguments["setpoint"], arguments["setpoint_amplitude"]) == ("random", 12.0)
+        assert recipe.dead_zone == 2.0
+        # Of twice as large temperatures and the same flows, the inputs are the same.
+        observation = np.ones(sum(recipe.windows.values()))
+        scaled = np.where(np.arange(observation.size) < 4 + recipe.memory, 2.0, 1.0)
+        rng = np.random.default_rng(0)
+        observation = rng.normal(size=observation.size)
+        np.testing.assert_allclose(
+            ppo.features(recipe) @ (scaled * observation), ppo.features(paper) @ observation
+        )
+        assert ppo.for_plant({}).plants == ppo.RECIPES["ppo"].plants
+
+    def test_what_is_trained_is_run_by_compare_on_this_plant(self, tmp_path, monkeypatch):
+        short = replace(ppo.RECIPES["ppo"], plants=((8, {}), (8, {})))
+        monkeypatch.setitem(ppo.RECIPES, "ppo", short)
+        given = "ppo --networks 2 --steps 8 --jobs 1 --set b=[0.0456,0.00404] --set u_max=12"
+        assert program.main([*given.split(), "--out", str(tmp_path)]) == 0
+        files = sorted(tmp_path.glob("ppo-plant-*.npz"))
+        assert len(files) == 2
+        (spec,) = chosen([], [f"mine={file}" for file in files]).values()
+        assert [each.provenance["file"] for each in spec.members()] == [*map(str, files)]
+        rising = {"b": [0.0456, 0.00404], "u_max": 12.0}
+        assert spec.misfit(Parameters(**rising)) == ""
+        assert "positive feedback" in spec.misfit(Parameters())
+        run = spec.members()[0].run({**rising, "setpoint": 5.0}, 20, 1, 0)
+        assert np.isfinite(run.output).all()

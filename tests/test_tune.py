@@ -1,5 +1,6 @@
 """The search for gains, on small budgets."""
 
+import json
 from unittest.mock import Mock
 
 import numpy as np
@@ -9,8 +10,12 @@ import pytest
 from agents import DirectNNController
 from agents.pi import SEARCHED_GAINS
 from benchmarks import tune
+from benchmarks.controllers.options import chosen
 from benchmarks.controllers.plant_scale import NN_SPANS, PI_SPANS
+from benchmarks.controllers.roster import ROSTER
+from benchmarks.lib.errors import UsageError
 from benchmarks.loop.scenarios import SCENARIOS
+from mptc_gym import Parameters
 from tests.conftest import ROOT
 
 
@@ -45,6 +50,53 @@ def search(out, runs=2, status=0):
     assert tune.main(given.split()) == status
     folder = out / "pi.unfinished" if status else out / "pi"
     return pd.read_csv(folder / "trials.csv")
+
+
+class TestOtherPlants:
+    PLANT = {  # noqa: RUF012
+        "b": [0.0912, 0.00808], "setpoint_amplitude": 10.0, "dead_zone": 3.0, "u_max": 20.0,
+        "noise_variance": 1.0, "disturbance_amplitude": 2.0, "setpoint_period": 300,
+    }  # fmt: skip
+
+    def test_a_search_on_the_paper_plant_is_the_one_of_before(self):
+        for name, case in tune.cases({}).items():
+            expected = Parameters(**tune.CASES[name].arguments)
+            assert (case.samples, case.first) == tune.CASES[name][:2]
+            assert Parameters(**case.arguments) == expected
+        assert tune.spans_of(ROSTER["pi"], {}) == PI_SPANS
+        assert tune.spans_of(ROSTER["nn"], {}) == NN_SPANS
+
+    def test_cases_and_spans_scale_with_the_plant(self):
+        found = tune.cases(self.PLANT)
+        learnt, quiet = (Parameters(**found[name].arguments) for name in ("learnt", "constant"))
+        assert (learnt.setpoint_amplitude, learnt.setpoint_period) == (10.4, 280)
+        assert learnt.disturbance_amplitude == 2.0
+        assert (quiet.setpoint, quiet.noise_variance, quiet.is_disturbed) == (9.6, 0.0, False)
+        assert found["learnt"].samples == 1120
+        assert found["dead zone"].arguments["dead_zone"] == pytest.approx(3.9)
+        assert found["noise"].arguments["noise_variance"] == pytest.approx(0.8)
+        # Twice the gain, of the other sign: half the gains of the controller, likewise.
+        low, high = tune.spans_of(ROSTER["pi"], self.PLANT)["kp"]
+        assert (low, high) == pytest.approx((-0.05, -5.0))
+
+
+def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path):
+    plant = tmp_path / "plant.json"
+    plant.write_text(json.dumps({"b": [0.0456, 0.00404]}))
+    given = f"pi --trials 3 --runs 2 --plant {plant} --out {tmp_path}"
+    assert tune.main(given.split()) == 0
+    file = tmp_path / "pi/gains.json"
+    gains = json.loads(file.read_text())["gains"]
+    assert gains["kp"] < 0.0
+    (spec,) = chosen([], [f"mine={file}"]).values()
+    rising, falling = (Parameters(b=b) for b in ([0.0456, 0.00404], [-0.0456, -0.00404]))
+    assert spec.misfit(rising) == ""
+    assert "positive feedback" in spec.misfit(falling)
+    controller = spec.make({"b": [0.0456, 0.00404]}, 1, 0)
+    assert (controller.kp, controller.ki) == (gains["kp"], gains["ki"])
+    file.write_text('{"controller": "pi"}')
+    with pytest.raises(UsageError, match=r"--agent: mine=.* must be a gains\.json"):
+        chosen([], [f"mine={file}"])
 
 
 @pytest.mark.usefixtures("short")

@@ -142,7 +142,9 @@ def noise(batch: Batch) -> Findings:
     runs = batch.run_nn(samples, **CONSTANT, **NOISY)
     error = (runs.setpoint - runs.output)[steady]
     alone = idle.output[steady].std(axis=0)
-    quantity = "mean of e over the last 600 of 1,200 samples, its size, constant set point"
+    quantity = (
+        "absolute value of the mean of e over the last 600 of 1,200 samples, constant set point"
+    )
     yield judge(quantity, np.abs(error.mean(axis=0)), "°C", at_most=0.05 * 5.0)
     quantity = "standard deviation of y over these samples, as a multiple of that without "
     quantity += "control"
@@ -242,7 +244,9 @@ def direction(batch: Batch) -> Findings:
     reachable = abs(linear.nominal(Parameters()).gain) * 10.0  # degC
     beyond = np.abs(runs.output) > 0.9 * reachable
     when = np.where(beyond.any(axis=0), np.argmax(beyond, axis=0), np.inf)
-    soon = f"y beyond 90 % of what the flow can do, either way, within {SOON} samples"
+    soon = (
+        f"y beyond 90 % of the largest deviation that the flow can cause, within {SOON} samples"
+    )
     yield judge_share(soon, when <= SOON, often=True)
     late = "the same when the run ends, after 600 samples"
     yield judge_share(late, beyond[-1], often=True)
@@ -378,8 +382,10 @@ def direction_only(batch: Batch) -> Findings:
     yield worst("delays from 9 to 36", five, "constant == 1 and gain == 1")
     constants = "time constants from 0.5 to 2 times the paper's"
     yield worst(constants, five, "gain == 1 and delay == 18")
-    for family in plants:
-        text = "gains from 0.7 to 1.5 times the paper's"
+    for family, found in plants.items():
+        text = (
+            f"gains from {found['gain'].min():g} to {found['gain'].max():g} times the paper's"
+        )
         yield worst(text, family, "constant == 1 and delay == 18")
     for family, found in plants.items():
         yield worst(f"all {len(found)} combinations", family)

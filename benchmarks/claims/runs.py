@@ -18,9 +18,10 @@ Array = NDArray[np.floating]
 Finding = dict[str, Any]  # a row of the table of numbers
 
 NOTE = (
-    "Every number rests on independent draws of initial weights and noise. What a claim asks "
-    "of a number counts as shown if the whole 95 % interval keeps it. A claim holds if all "
-    "that it asks is shown, and in part if some is."
+    "Each case is run with independent initial weights and noise. A mean error is that of one "
+    "run over its samples; the number in the table, like a ratio of such errors, is the median "
+    "over the runs. A criterion counts as shown only if the entire 95 % confidence interval "
+    "satisfies it. A claim holds if all its criteria are shown, and in part if some are."
 )
 OFTEN = 0.9  # "works", "converges": in at least this share of the draws
 

@@ -37,8 +37,10 @@ def scales(plant: Parameters) -> dict[str, float]:
     model = nominal(plant)
     gain = abs(float(model.gain))
     half_range = (model.numbers.u_max - model.numbers.u_min) / 2.0
-    rate = 1.0 - abs(slowest_pole((1.0, *-model.alpha)))
-    time_constant = 1.0 / rate if rate > 0.0 else math.inf
+    pole = abs(slowest_pole((1.0, *-model.alpha)))
+    time_constant = math.inf if pole >= 1.0 else 0.0
+    if 0.0 < pole < 1.0:
+        time_constant = -1.0 / math.log(pole)
     return {
         "gain, °C per t/h": gain,
         "reach of half the flow's range, °C": gain * half_range,

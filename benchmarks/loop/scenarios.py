@@ -89,6 +89,17 @@ class PlantOptions:
         file = self.plant.stem if self.plant else None
         return ", ".join(filter(None, [self.preset, file, *self.set]))
 
+    def words(self) -> list[str]:
+        """Return the words of a command line that make the same choice."""
+        words: list[str] = []
+        if self.preset:
+            words += ["--preset", self.preset]
+        if self.plant:
+            words += ["--plant", str(self.plant)]
+        for argument in self.set:
+            words += ["--set", argument]
+        return words
+
     def cases(self, others: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
         """Return the cases for the chosen plant, or the others if none is chosen.
 

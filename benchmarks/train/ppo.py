@@ -21,6 +21,7 @@ from torch import nn
 
 from agents import Increments, PolicyNetwork
 from benchmarks.controllers.plant_scale import scales
+from benchmarks.controllers.spec import LIMITS, knowledge
 from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
 from benchmarks.lib.provenance import versions
 from benchmarks.lib.seeds import SEEDS
@@ -139,6 +140,9 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
     model.learn(recipe.steps, callback=Exploration(*recipe.log_std))
     seconds = time.process_time() - began
     policy = export(model, recipe)
+    if plant is not None:
+        parameters = Parameters(**plant)
+        policy = replace(policy, **knowledge(LIMITS, parameters, 1, seed))
     validation = {
         name: evaluate(policy, seed=VALIDATION_SEED, **recipe.windows, **case).mean_error
         for name, case in recipe.cases.items()
