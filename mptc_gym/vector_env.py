@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.checks import is_count, many_actions, one_of, plain, reject
+from mptc_gym.draws import Ranges, Streams, plant_numbers
 from mptc_gym.env import NO_MODE, Frame, MiddlePointEnv
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.record import Record
-from mptc_gym.signals import BLOCK, Indices, Ranges, Signals, Streams, Values, plant_numbers
+from mptc_gym.signals import BLOCK, Indices, Signals, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 

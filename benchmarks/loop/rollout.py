@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.acting import rollout as run_batch
+from mptc_gym.draws import Ranges
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import action_from_command, least_effective
-from mptc_gym.signals import Ranges
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vect
 
 def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[Array]:
     """Return the plant numbers that the environment draws for each run, shape (runs,)."""
-    numbers = Ranges(parameters).given.chosen(tuple(PLANT_NUMBERS))
+    numbers = Ranges(parameters).lowest.chosen(tuple(PLANT_NUMBERS))
     if parameters.ranges:
         _, info = make_plants(runs, 1, **asdict(parameters)).reset(seed=seed)
         numbers |= {name: info[name] for name in parameters.ranges}
