@@ -340,12 +340,14 @@ class _InputResponse:
 
     def add(self, applied: Values) -> Values:
         """Add u_a(k), t/h, and return the response in y(k+1), degC; only to be read."""
-        self._inputs[self._first_row + self._older + self._place] = applied
-        self._place += 1
-        if self._place == self._block:
+        place = self._place
+        self._inputs[self._first_row + self._older + place] = applied
+        place += 1
+        if place == self._block:
             self._respond()
-            self._place = 0
-        response: Values = self._response[self._place]
+            place = 0
+        self._place = place
+        response: Values = self._response[place]
         return response
 
     def _respond(self) -> None:
