@@ -90,9 +90,9 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
 
         Returns
         -------
-        observations
+        observations : array
             Shape (num_envs, size). Those of plants that are not reset are their last ones.
-        infos
+        infos : dict
             Arrays of shape (num_envs,), and their masks, which are False for plants that are
             not reset. Several masks may be the same array.
 
@@ -122,11 +122,11 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
 
         Returns
         -------
-        observations
+        observations : array
             Shape (num_envs, size).
-        rewards, terminations, truncations
+        rewards, terminations, truncations : array
             Shape (num_envs,). No episode terminates.
-        infos
+        infos : dict
             Arrays of shape (num_envs,), and their masks. Several masks may be the same array.
 
         Raises

@@ -297,8 +297,14 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
 
         Returns
         -------
-        observation, reward, terminated, truncated, info
-            Those at k+1. `terminated` and `truncated` are always False.
+        observation : ndarray of float32
+            The observation at k+1, shape (size,).
+        reward : float
+            The reward of e(k+1).
+        terminated, truncated : bool
+            Always False.
+        info : dict of float
+            The info at k+1.
 
         Raises
         ------

@@ -94,11 +94,11 @@ class Dynamics:
 
         Returns
         -------
-        alpha
+        alpha : list
             Factors of y(k-1), y(k-2), ...: the coefficients of A from z^-1 on, negated.
-        scale
+        scale : float or array
             Factor g / t of B.
-        load_gain
+        load_gain : float or array
             Factor A(1) of the load w(k).
         """
         alpha: list[Any] = list(self._alpha)
