@@ -198,21 +198,21 @@ def read_signals(
         reject("options['signals']", signals, allowed)
     if not signals or not names >= {*signals}:
         reject("options['signals']", [*signals], allowed)
-    given: dict[str, Given] = {}
+    checked: dict[str, Given] = {}
     last_sample: int | None = None
     for name, value in signals.items():
         path = f"options['signals'][{name!r}]"
         if name in parameters.ranges:
             values = _read_values(path, value, 1, episodes.zeros)
             _check_range(path, value, values, parameters.ranges[name])
-            given[name] = Given(values[:, None], episodes)
+            checked[name] = Given(values[:, None], episodes)
         else:
             values = _read_values(path, value, 2, episodes.zeros)
-            given[name] = Given(values, episodes)
+            checked[name] = Given(values, episodes)
             last_of_signal = values.shape[1] - 1
             if last_sample is None or last_of_signal < last_sample:
                 last_sample = last_of_signal
-    return given, last_sample
+    return checked, last_sample
 
 
 def _read_values(path: str, value: Any, dimensions: int, zeros: Tensor) -> Tensor:
