@@ -1,4 +1,4 @@
-"""Model the actuator (29), and choose commands that it passes."""
+"""Model the actuator (29), and choose commands that have an effect."""
 
 from typing import Any
 
@@ -23,21 +23,24 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     effect. Such an action is moved outwards by one float. Arguments broadcast.
     """
     action = np.asarray(2.0 * (command - u_min) / (u_max - u_min) - 1.0, dtype=np.float32)
-    if np.ndim(dead_zone) or dead_zone > 0.0:
-        arrives = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
-        lost = (np.abs(command) >= dead_zone) & (np.abs(arrives) < dead_zone)
-        if lost.any():
-            # The plant adds 1, which rounds away steps finer than the float spacing at 1.
-            step = np.spacing(np.maximum(np.abs(action), np.float32(1)))
-            action = np.where(lost, action + np.copysign(step, command), action)
-            action = action.astype(np.float32)
-    return action
+    if np.ndim(dead_zone) == 0 and dead_zone <= 0.0:
+        return action
+    # The command that the plant computes from the action.
+    rounded = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
+    lost_its_effect = (np.abs(command) >= dead_zone) & (np.abs(rounded) < dead_zone)
+    if not lost_its_effect.any():
+        return action
+    # The plant adds 1, which rounds away steps finer than the float spacing at 1.
+    spacing = np.spacing(np.maximum(np.abs(action), np.float32(1)))
+    outwards = action + np.copysign(spacing, command)
+    return np.where(lost_its_effect, outwards, action).astype(np.float32)
 
 
 def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
-    """Move commands closer to 0 than `edge` to this edge or to 0, whichever is nearer.
+    """Move commands inside the dead zone to its edge or to 0, whichever is nearer.
 
-    `xp` is the array module, NumPy or PyTorch.
+    `edge` is the half width of the dead zone, t/h. `xp` is the array module, NumPy or PyTorch.
     """
-    size = abs(command)
-    return xp.where(size < edge, edge * xp.sign(command) * (size >= edge / 2.0), command)
+    magnitude = abs(command)
+    edge_or_0 = edge * xp.sign(command) * (magnitude >= edge / 2.0)
+    return xp.where(magnitude < edge, edge_or_0, command)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache
 from numbers import Integral, Real
-from typing import Annotated, Any, Final, get_type_hints
+from typing import Annotated, Any, Final, NoReturn, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,40 +19,122 @@ PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}  # the paper's 
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
 MOST = 1_000_000  # nodes, loops, elements or samples; a larger number is a mistake
 
-# Types of arguments, each with what is allowed, in words and as a condition.
-Number = Annotated[float, "a finite number", math.isfinite]
-NotNegative = Annotated[float, "a finite number of at least 0", lambda x: 0.0 <= x < math.inf]
-Positive = Annotated[float, "a finite number above 0", lambda x: 0.0 < x < math.inf]
-Gain = Annotated[float, "a finite number other than 0", lambda x: 0.0 < abs(x) < math.inf]
-Flag = Annotated[bool, "True or False", lambda x: True]
-Index = Annotated[int, "an integer of at least 0", lambda x: x >= 0]
-Count = Annotated[int, "an integer of at least 1", lambda x: x >= 1]
-Size = Annotated[int, f"an integer from 1 to {MOST:,}", lambda x: 1 <= x <= MOST]
+Validator = Callable[[str, Any], Any]
 
 
-def check(name: str, value: Any, of: Any) -> Any:
-    """Return `value` if it is of a type such as `Positive`; otherwise raise a ValueError."""
-    plain, (allowed, holds) = of.__origin__, of.__metadata__
-    fits = isinstance(value, bool | np.bool_)
-    if plain is not bool:
-        fits = not fits and isinstance(value, Integral if plain is int else Real)
-    if fits and holds(value):
-        return plain(value)
+def _reject(name: str, value: Any, allowed: str) -> NoReturn:
+    """Raise a ValueError that says what an argument must be and what it is."""
     raise ValueError(f"{name} must be {allowed}, got {value!r}")
 
 
+def _is_real(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
+
+
+# Validators of arguments. They return a plain float, int or bool if the value is allowed, and
+# raise a ValueError that names the argument otherwise.
+
+
+def finite(name: str, value: Any) -> float:
+    """Check that a value is a finite number."""
+    if not (_is_real(value) and math.isfinite(value)):
+        _reject(name, value, "a finite number")
+    return float(value)
+
+
+def not_negative(name: str, value: Any) -> float:
+    """Check that a value is a finite number of at least 0."""
+    if not (_is_real(value) and 0.0 <= value < math.inf):
+        _reject(name, value, "a finite number of at least 0")
+    return float(value)
+
+
+def positive(name: str, value: Any) -> float:
+    """Check that a value is a finite number above 0."""
+    if not (_is_real(value) and 0.0 < value < math.inf):
+        _reject(name, value, "a finite number above 0")
+    return float(value)
+
+
+def nonzero(name: str, value: Any) -> float:
+    """Check that a value is a finite number other than 0."""
+    if not (_is_real(value) and 0.0 < abs(value) < math.inf):
+        _reject(name, value, "a finite number other than 0")
+    return float(value)
+
+
+def flag(name: str, value: Any) -> bool:
+    """Check that a value is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        _reject(name, value, "True or False")
+    return bool(value)
+
+
+def integer_from_0(name: str, value: Any) -> int:
+    """Check that a value is an integer of at least 0."""
+    if not (_is_integer(value) and value >= 0):
+        _reject(name, value, "an integer of at least 0")
+    return int(value)
+
+
+def integer_from_1(name: str, value: Any) -> int:
+    """Check that a value is an integer of at least 1."""
+    if not (_is_integer(value) and value >= 1):
+        _reject(name, value, "an integer of at least 1")
+    return int(value)
+
+
+def integer_to_most(name: str, value: Any) -> int:
+    """Check that a value is an integer from 1 to `MOST`."""
+    if not (_is_integer(value) and 1 <= value <= MOST):
+        _reject(name, value, f"an integer from 1 to {MOST:,}")
+    return int(value)
+
+
+# Types for the fields of controllers, each with its validator, which the constructor applies.
+Number = Annotated[float, finite]
+NotNegative = Annotated[float, not_negative]
+Positive = Annotated[float, positive]
+Gain = Annotated[float, nonzero]
+Flag = Annotated[bool, flag]
+Index = Annotated[int, integer_from_0]
+Count = Annotated[int, integer_from_1]
+Size = Annotated[int, integer_to_most]
+
+
+def check(name: str, value: Any, annotation: Any) -> Any:
+    """Return a value that the validator of a type such as `Positive` accepts.
+
+    A ValueError is raised if it does not.
+    """
+    (validator,) = annotation.__metadata__
+    return validator(name, value)
+
+
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return `value` as float64 if it holds real numbers; otherwise raise a ValueError."""
+    """Return real numbers as a float64 array; raise a ValueError for anything else."""
     try:
-        given = np.asarray(value)
-        if given.dtype.kind in "biufO":  # neither text, which NumPy would parse, nor complex
-            return given.astype(np.float64, copy=False)
+        array = np.asarray(value)
+        if array.dtype.kind in "biufO":  # neither text, which NumPy would parse, nor complex
+            return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # the last from tensors
         pass
     raise ValueError(f"{name} must be numbers, got {value!r}")
 
 
-_types_of = cache(partial(get_type_hints, include_extras=True))  # which is slow
+@cache  # as reading the annotations is slow
+def _validated_fields(controller: type) -> dict[str, Any]:
+    """Return the annotations of a controller's fields that have a validator, by name."""
+    annotations = get_type_hints(controller, include_extras=True)
+    return {
+        name: annotation
+        for name, annotation in annotations.items()
+        if hasattr(annotation, "__metadata__")
+    }
 
 
 @dataclass(eq=False, kw_only=True)
@@ -63,8 +146,10 @@ class Controller(ABC):
 
     Parameters
     ----------
-    u_min, u_max
-        Limits of the actuator, t/h. They scale the action, and do not clip commands.
+    u_min
+        Lower limit of the actuator, t/h. The limits scale the action, and do not clip commands.
+    u_max
+        Upper limit of the actuator, t/h.
 
     Attributes
     ----------
@@ -84,13 +169,15 @@ class Controller(ABC):
     n_obs: int = field(init=False, repr=False)
     command: Values = field(init=False, repr=False)
 
-    _edge = 0.0  # of the dead zone, t/h; a command on it keeps its effect as an action
-    _remembers = True  # past samples; if not, the batch size may change at any time
+    # Half width of the dead zone, t/h: commands on its edge keep their effect as actions.
+    _edge = 0.0
+    # Whether the controller remembers past samples. If not, the batch size may always change.
+    _remembers = True
 
     def __post_init__(self) -> None:
-        for name, of in _types_of(type(self)).items():
-            if hasattr(of, "__metadata__"):
-                setattr(self, name, check(name, getattr(self, name), of))
+        """Check the arguments and reset. Subclasses add what `reset` does not need."""
+        for name, annotation in _validated_fields(type(self)).items():
+            setattr(self, name, check(name, getattr(self, name), annotation))
         if self.u_min >= self.u_max:
             raise ValueError(f"u_min must be below u_max = {self.u_max!r}, got {self.u_min!r}")
         self.reset()
@@ -98,14 +185,26 @@ class Controller(ABC):
     def reset(self) -> None:
         """Forget the episode, but keep what was learnt."""
         self.command = np.float64(0.0)
-        self._loops_before: tuple[int, ...] | None = None  # since `reset`, () or (batch,)
+        # Shape of the loops since `reset`, () or (batch,); None before the first sample.
+        self._loops_before: tuple[int, ...] | None = None
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
-        """Refuse plants that the controller was not made for: scores would be wrong in silence.
+        """Refuse plants that the controller was not made for, as their scores would be wrong.
 
-        `parameters` are the arguments of all `n` plants, by name as in `mptc_gym.Parameters`,
-        and `wrapped` names wrappers that change observations or actions, if any. A ValueError
-        says what does not fit: limits, places in the observation, number of loops, wrappers.
+        Parameters
+        ----------
+        parameters
+            The arguments of the plants, as attributes with the names of `mptc_gym.Parameters`;
+            arrays if they differ between plants.
+        wrapped
+            The names of wrappers that change observations or actions; "" without any.
+        n
+            Number of plants.
+
+        Raises
+        ------
+        ValueError
+            If limits, places in the observation, wrappers or the number of loops do not fit.
         """
         # Where limits are drawn, the controller has the widest.
         limits = float(np.min(parameters.u_min)), float(np.max(parameters.u_max))
@@ -114,10 +213,11 @@ class Controller(ABC):
                 f"policy must be made with the limits of env, u_min={limits[0]}, "
                 f"u_max={limits[1]}, got {self.u_min}, {self.u_max}"
             )
-        place = 0  # of the newest sample of a signal
+        place = 0  # of the signal's newest sample in the observation
         for signal in ("setpoint", "error"):
             window = getattr(parameters, f"{signal}_window")
-            index = getattr(self, f"{signal}_index", None)  # None where it is not read alone
+            # None if the controller does not read this element alone.
+            index = getattr(self, f"{signal}_index", None)
             if index is not None and (index != place or not window):
                 raise ValueError(
                     f"env must show its newest {signal} as element {index} of the observation, "
@@ -159,15 +259,16 @@ class Controller(ABC):
             )
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")
-        now, before = values.shape[:-1], self._loops_before
-        if before not in (None, now):
+        loops = values.shape[:-1]
+        if self._loops_before not in (None, loops):
             raise ValueError(
-                f"observation must have shape {(*before, self.n_obs)}, that of the loops since "
-                f"reset or of num_envs, got {values.shape}"
+                f"observation must have shape {(*self._loops_before, self.n_obs)}, that of the "
+                f"loops since reset or of num_envs, got {values.shape}"
             )
-        command = self._control(np.atleast_2d(values))
-        self.command = command if len(now) else command[0]
-        self._loops_before = now if self._remembers else None
+        commands = self._control(np.atleast_2d(values))
+        self.command = commands if loops else commands[0]
+        if self._remembers:
+            self._loops_before = loops
         return float32_action(self.command, self.u_min, self.u_max, self._edge)[..., np.newaxis]
 
     @abstractmethod

@@ -45,7 +45,7 @@ class Weights:
     def load(cls, path: str | PathLike[str]) -> Weights:
         """Read weights written by `save`; errors are those of `agents.networks.reading`."""
         with reading(path, "weights") as file:
-            return cls(**{each.name: file[each.name] for each in fields(cls)})
+            return cls(**{field.name: file[field.name] for field in fields(cls)})
 
 
 @dataclass(eq=False, kw_only=True)
@@ -58,8 +58,10 @@ class DirectNNController(Controller):
 
     Parameters
     ----------
-    u_min, u_max
-        U_min and U_max, the range of the command, t/h.
+    u_min
+        U_min, the lowest command, t/h.
+    u_max
+        U_max, the highest command, t/h.
     n_inputs
         N, number of inputs, which are the first N elements of the observation.
     n_hidden
@@ -120,24 +122,36 @@ class DirectNNController(Controller):
     update_interval: Count = 1
 
     def __post_init__(self) -> None:
-        self._batch = () if self.num_envs is None else (self.num_envs,)  # the leading axis
-        self._own = slice(None) if self._batch else 0  # of arrays with such an axis
         super().__post_init__()
-        self.n_obs = max(self.n_inputs, self.error_index + 1)
         if abs(self.direction) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
         if self.num_envs is not None:
             check("num_envs", self.num_envs, Size)
-        hidden, of_W = (self.n_hidden,), (self.n_hidden, self.n_inputs)
-        self._shapes = {"W": of_W, "theta_1": hidden, "W_1": hidden, "theta_2": ()}
-        seeds, scale = range(self.seed, self.seed + (self.num_envs or 1)), self.weight_scale
-        generators = [np.random.default_rng(seed) for seed in seeds]
-        self.weights = Weights(
-            *(
-                np.array([each.uniform(-scale, scale, shape) for each in generators])[self._own]
-                for shape in self._shapes.values()
-            )
-        )
+        self.n_obs = max(self.n_inputs, self.error_index + 1)
+        # Shapes of one network's weights.
+        self._shapes = {
+            "W": (self.n_hidden, self.n_inputs),
+            "theta_1": (self.n_hidden,),
+            "W_1": (self.n_hidden,),
+            "theta_2": (),
+        }
+        self.weights = self._initial_weights()
+
+    def _initial_weights(self) -> Weights:
+        """Draw the weights of every network of the batch from its own seed."""
+        members = self.num_envs or 1
+        generators = [np.random.default_rng(self.seed + i) for i in range(members)]
+        arrays: dict[str, Array] = {}
+        for name, shape in self._shapes.items():
+            scale = self.weight_scale
+            draws = [generator.uniform(-scale, scale, shape) for generator in generators]
+            arrays[name] = np.array(draws).reshape(self._batch_shape + shape)
+        return Weights(**arrays)
+
+    @property
+    def _batch_shape(self) -> tuple[int, ...]:
+        """The leading axis of weights and observations: () or (num_envs,)."""
+        return () if self.num_envs is None else (self.num_envs,)
 
     @property
     def weights(self) -> Weights:
@@ -150,21 +164,34 @@ class DirectNNController(Controller):
         ValueError
             If a shape does not fit or a value is not finite; the weights are then unchanged.
         """
-        return Weights(*(np.array(array.T[self._own], order="C") for array in self._arrays))
+        arrays: dict[str, Array] = {}
+        for name, stored in zip(self._shapes, self._arrays, strict=True):
+            array = stored.T if self._batch_shape else stored.T[0]
+            arrays[name] = np.array(array, order="C")
+        return Weights(**arrays)
 
     @weights.setter
     def weights(self, weights: Weights) -> None:
         arrays = []
         for name, shape in self._shapes.items():
-            given, shapes = getattr(weights, name), (shape, self._batch + shape)
-            array = check_array(f"weights.{name}", given, *shapes, dtype=np.float64)
-            every = np.broadcast_to(array, (self.num_envs or 1, *shape))
-            arrays.append(np.array(every.T, order="C"))
-        # The batch axis is last, so that sums over nodes add long rows; W is (N, N_1, batch).
+            array = check_array(
+                f"weights.{name}",
+                getattr(weights, name),
+                shape,
+                self._batch_shape + shape,
+                dtype=np.float64,
+            )
+            batch = np.broadcast_to(array, (self.num_envs or 1, *shape))
+            arrays.append(np.array(batch.T, order="C"))
+        # In the order of `Weights`. The batch axis is last, so that sums over nodes add long
+        # rows: W is stored as (N, N_1, batch).
         self._arrays = arrays
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
-        """Refuse plants that the controller was not made for; see `Controller`."""
+        """Refuse plants that the controller was not made for.
+
+        See `Controller`; here, `num_envs` must be the number of plants, too.
+        """
         super().check_environment(parameters, wrapped, n)
         if self.num_envs != n:
             raise ValueError(
@@ -175,10 +202,11 @@ class DirectNNController(Controller):
     def reset(self) -> None:
         """Forget the episode, but keep the weights."""
         super().reset()
-        self._loops_before = self._batch
+        self._loops_before = self._batch_shape
         self._sample = 0  # k
 
     def _control(self, rows: Array) -> Array:
+        """Take steps A to E of Section 4: return u, then learn from e."""
         X = self.input_scale * np.ascontiguousarray(rows[:, : self.n_inputs].T)  # (N, batch)
         e = rows[:, self.error_index]
 
@@ -199,12 +227,16 @@ class DirectNNController(Controller):
 
 
 def _sum_of_rows(terms: Array) -> Array:
-    # One after the other, whatever the shape: the order in which np.sum adds can depend on the
-    # batch size, and then a batch would not equal its single members bit for bit.
+    """Return the sum over the first axis, added one row after the other.
+
+    The order in which np.sum adds can depend on the batch size, and then a batch would not
+    equal its single members bit for bit.
+    """
     total: Array = np.add.accumulate(terms, axis=0)[-1]
     return total
 
 
 def _sigmoid(x: Array) -> Array:
-    activation: Array = 1.0 / (1.0 + np.exp(np.minimum(-x, 700.0)))  # (4); no overflow
+    """Return 1 / (1 + exp(-x)), (4), without overflow."""
+    activation: Array = 1.0 / (1.0 + np.exp(np.minimum(-x, 700.0)))
     return activation

@@ -76,8 +76,12 @@ class PIController(Controller):
 
         Parameters
         ----------
-        gain, time_constant, delay
-            k, tau_1 and theta of the plant: degC per t/h (of either sign), s and s.
+        gain
+            k, the plant's steady-state gain, degC per t/h, of either sign.
+        time_constant
+            tau_1, the plant's time constant, s.
+        delay
+            theta, the plant's delay, s.
         closed_loop_time_constant
             tau_c, s; by default the delay, "tight control with good robustness".
         sampling_interval
@@ -90,8 +94,9 @@ class PIController(Controller):
         theta = check("delay", delay, NotNegative)
         if closed_loop_time_constant is None and theta == 0.0:
             raise ValueError("closed_loop_time_constant must be given where delay is 0")
-        tau_c = theta if closed_loop_time_constant is None else closed_loop_time_constant
-        tau_c = check("closed_loop_time_constant", tau_c, Positive)
+        if closed_loop_time_constant is None:
+            closed_loop_time_constant = theta
+        tau_c = check("closed_loop_time_constant", closed_loop_time_constant, Positive)
         interval = check("sampling_interval", sampling_interval, Positive)
         kp = -tau_1 / (k * (tau_c + theta))  # (23), with the sign of u = -Kp e
         tau_i = min(tau_1, 4 * (tau_c + theta))  # (24)
@@ -114,14 +119,16 @@ class PIController(Controller):
         return numerator, np.array([1.0, -1.0])
 
     def _control(self, rows: Array) -> Array:
+        """Return u, t/h, and add the errors to the integral."""
         error: Array = rows[:, self.error_index]
         total = self._sum + error
         command = -self.kp * error - self.ki * total  # Section 5
         if self.anti_windup:
-            drive = -self.ki * error  # what this error adds to the command from now on
-            above, below = command > self.u_max, command < self.u_min
-            outward = above & (drive > 0) | below & (drive < 0)
-            total = np.where(outward, self._sum, total)
+            change = -self.ki * error  # of the command, through the integral
+            is_above = command > self.u_max
+            is_below = command < self.u_min
+            drives_outward = is_above & (change > 0) | is_below & (change < 0)
+            total = np.where(drives_outward, self._sum, total)
             command = -self.kp * error - self.ki * total
         self._sum = total
         return command

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.lib.command import Count, Names, Parameter, command, options
 from benchmarks.lib.errors import UnfinishedError
@@ -16,21 +17,34 @@ from benchmarks.lib.seeds import SEEDS
 from benchmarks.lib.storage import out_folder
 from mptc_gym import PRESETS, evaluate
 
-SAMPLES, EPISODES = 1200, 100  # per episode, and per data set
+SAMPLES = 1200  # in an episode
+EPISODES = 100  # in a data set
 SEED = SEEDS["data sets"].first  # of the first episode
-EVALUATIONS = 50  # episodes to evaluate learners on; the data holds none of them
+EVALUATIONS = 50  # episodes to evaluate learners on, none of which is in the data
+# Names of controllers, which take turns, episode by episode.
 BEHAVIOURS = {
     "pi": ("pi",),
     "smith": ("smith",),
-    "mixed": ("pi", "pi-simc", "smith", "nn"),  # controllers take turns, episode by episode
+    "mixed": ("pi", "pi-simc", "smith", "nn"),
 }
 IDS = {
     f"middlepoint/{plant}/{behaviour}-v0": (plant, behaviour)
     for plant in ("paper", "disturbed", "fouling")
     for behaviour in BEHAVIOURS
 }
-COLUMNS = "controller", "seed", "observations", "actions", "rewards"  # of an episode
-VARIABLE, HOME = "MINARI_DATASETS_PATH", "~/.minari/datasets"
+VARIABLE = "MINARI_DATASETS_PATH"  # the environment variable with Minari's folder
+HOME = "~/.minari/datasets"  # Minari's folder if this variable is not set
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A logged episode of N samples."""
+
+    controller: str
+    seed: int
+    observations: NDArray[np.float32]  # shape (N + 1, size)
+    actions: NDArray[np.float32]  # within [-1, 1], shape (N, 1)
+    rewards: NDArray[np.float64]  # -|e(k+1)|, degC, shape (N,)
 
 
 @options
@@ -57,49 +71,68 @@ def work(options: Options) -> str:
 
 def arguments_of(plant: str) -> dict[str, Any]:
     """Return the arguments of the environment that a plant's data sets come from."""
-    # The past actions make the problem Markov while the set point holds. The reward is -|e|.
-    logged = {"reward": "absolute", "error_scale": 1.0, "action_window": 20}
-    return {**PRESETS[plant], "setpoint": "random", **logged}
+    return {
+        **PRESETS[plant],
+        "setpoint": "random",
+        "reward": "absolute",  # with this scale, -|e|
+        "error_scale": 1.0,
+        "action_window": 20,  # which makes the problem Markov while the set point holds
+    }
 
 
-def record(plant: str, behaviour: str, episodes: int = EPISODES) -> list[dict[str, Any]]:
-    """Log a plant of `IDS` under the controllers of one of `BEHAVIOURS`, which take turns.
+def record(plant: str, behaviour: str, episodes: int = EPISODES) -> list[Episode]:
+    """Return episodes of a plant under the controllers of one of `BEHAVIOURS`.
 
-    Episode i is a dict of `COLUMNS`: its controller, its seed, which is `SEED + i`, and arrays
-    of observations, actions within [-1, 1], and rewards, -|e(k+1)| in degC.
+    The controllers take turns. Episode i has the seed `SEED + i`.
     """
+    names = BEHAVIOURS[behaviour][:episodes]
+    by_seed: dict[int, Episode] = {}
+    for turn, name in enumerate(names):
+        seeds = list(range(SEED + turn, SEED + episodes, len(names)))
+        for episode in _record_controller(plant, name, seeds):
+            by_seed[episode.seed] = episode
+    return [by_seed[seed] for seed in sorted(by_seed)]
+
+
+def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]:
+    """Return one episode of a plant under a controller for each seed, all run side by side."""
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.loop.rollout import make_plants
 
-    arguments, names = arguments_of(plant), BEHAVIOURS[behaviour][:episodes]
-    logged: list[dict[str, Any]] = [{}] * episodes
-    for turn, name in enumerate(names):
-        seeds = list(range(SEED + turn, SEED + episodes, len(names)))
-        controller: Any = ROSTER[name].in_service(arguments, len(seeds), SEED)
-        controller.reset()
-        plants: Any = make_plants(len(seeds), SAMPLES, **arguments)
-        seen, _ = plants.reset(seed=seeds)
-        observations, actions, errors = [seen], [], []
-        for _ in range(SAMPLES):
-            # Beyond +-1 the actuator saturates: clipping does not change what the plant does.
-            actions.append(np.clip(controller.act(seen), -1.0, 1.0).astype(np.float32))
-            seen, _, _, _, info = plants.step(actions[-1])
-            observations.append(seen)
-            errors.append(info["error"])
-        rewards: Any = -np.abs(errors)
-        arrays = (np.stack(each, axis=1) for each in (observations, actions, rewards))
-        rows = zip([name] * len(seeds), seeds, *arrays, strict=True)
-        logged[turn :: len(names)] = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
-    return logged
+    arguments = arguments_of(plant)
+    controller: Any = ROSTER[name].in_service(arguments, len(seeds), SEED)
+    controller.reset()
+    plants: Any = make_plants(len(seeds), SAMPLES, **arguments)
+    observation, _ = plants.reset(seed=seeds)
+    observations = [observation]
+    actions = []
+    errors = []
+    for _ in range(SAMPLES):
+        # Beyond +-1 the actuator saturates: clipping does not change what the plant does.
+        action = np.clip(controller.act(observation), -1.0, 1.0).astype(np.float32)
+        observation, _, _, _, info = plants.step(action)
+        actions.append(action)
+        observations.append(observation)
+        errors.append(info["error"])
+    columns = zip(
+        seeds,
+        np.stack(observations, axis=1),
+        np.stack(actions, axis=1),
+        np.stack([-np.abs(error) for error in errors], axis=1),
+        strict=True,
+    )
+    return [Episode(name, *column) for column in columns]
 
 
 def write(root: Path, name: str, episodes: int) -> str:
     """Write a complete data set or none, replacing that of this id; return its mean errors."""
-    place, logged = root / name, record(*IDS[name], episodes)
+    place = root / name
+    logged = record(*IDS[name], episodes)
     try:
         # Minari does not list the contents of hidden folders.
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
-            # HDF5 crashes where a disk is full. So as much as a set takes is written before.
+            # HDF5 crashes where a disk is full. So a file as large as a data set is written,
+            # and removed, before.
             room = Path(partial, "room")
             room.write_bytes(bytes(1_000_000 + episodes * 250_000))
             room.unlink()
@@ -115,44 +148,62 @@ def write(root: Path, name: str, episodes: int) -> str:
     return errors
 
 
-def _create(name: str, episodes: list[dict[str, Any]]) -> str:
+def _create(name: str, episodes: list[Episode]) -> str:
     """Write a data set to Minari's folder, and return its mean errors."""
     import minari
     from minari.data_collector import EpisodeBuffer
 
     plant, behaviour = IDS[name]
-    arguments, controllers = arguments_of(plant), ", ".join(BEHAVIOURS[behaviour])
-    idle = evaluate(lambda seen: np.zeros((len(seen), 1)), episodes=EVALUATIONS, **arguments)
-    least = float(np.asarray(idle.least).mean())
-    error = float(-np.mean([each["rewards"] for each in episodes]))
-    ends = {"terminations": [False] * SAMPLES, "truncations": [*[False] * (SAMPLES - 1), True]}
+    arguments = arguments_of(plant)
+    idle = evaluate(_keep_valve_idle, episodes=EVALUATIONS, **arguments)
+    least_error = float(np.asarray(idle.least).mean())
+    mean_error = float(-np.mean([episode.rewards for episode in episodes]))
+    buffers = [
+        EpisodeBuffer(
+            seed=episode.seed,
+            observations=episode.observations,
+            actions=episode.actions,
+            rewards=episode.rewards,
+            terminations=[False] * SAMPLES,
+            truncations=[*[False] * (SAMPLES - 1), True],
+        )
+        for episode in episodes
+    ]
     env = gymnasium.make("MiddlePoint-v0", max_episode_steps=SAMPLES, **arguments)
     dataset = minari.create_dataset_from_buffers(
         name,
-        [EpisodeBuffer(**{key: each[key] for key in COLUMNS[1:]}, **ends) for each in episodes],
+        buffers,
         env=env,
         eval_env=env,
-        algorithm_name=controllers,
+        algorithm_name=", ".join(BEHAVIOURS[behaviour]),
         author="The mptc_gym developers",
         author_email="",  # None would be a warning, here and below
         code_permalink="",
         description=f"Preset {plant} with random set points. The reward is -|error| in degC.",
         ref_min_score=-idle.mean_error * SAMPLES,
-        ref_max_score=-least * SAMPLES,
+        ref_max_score=-least_error * SAMPLES,
         num_episodes_average_score=EVALUATIONS,
         data_format="hdf5",
     )
-    about = {
-        "behaviour_error": error,
-        "least_possible_error": least,
+    metadata = {
+        "behaviour_error": mean_error,
+        "least_possible_error": least_error,
         "idle_error": idle.mean_error,
         "evaluation_seeds": list(idle.seeds),
     }
-    dataset.storage.update_metadata(about)
-    controllers_of = [{"controller": each["controller"]} for each in episodes]
-    dataset.storage.update_episode_metadata(controllers_of)
-    bounds = f"least possible {least:.3f}, no control {idle.mean_error:.3f}"
-    return f"mean |e| {error:.3f} °C, {bounds}"
+    dataset.storage.update_metadata(metadata)
+    dataset.storage.update_episode_metadata(
+        [{"controller": episode.controller} for episode in episodes]
+    )
+    return (
+        f"mean |e| {mean_error:.3f} °C, least possible {least_error:.3f}, "
+        f"no control {idle.mean_error:.3f}"
+    )
+
+
+def _keep_valve_idle(observations: Any) -> NDArray[np.float64]:
+    """Return the actions that keep the flow at 0 t/h, whatever the observations."""
+    return np.zeros((len(observations), 1))
 
 
 main = command("datasets", Options, work)

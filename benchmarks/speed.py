@@ -17,7 +17,7 @@ EPISODE = 1200  # steps
 BATCHES = (1, 8, 64, 1024, 16384)
 ON_DEVICE = tuple(4**power for power in range(5, 12))  # 1,024 to 4,194,304 plants
 REFERENCE, PLANT = "CartPole-v1", "MiddlePoint-v0"
-# By what follows the name.
+# Arguments of the measured plants, by the end of their names in the table.
 PLANTS: dict[str, Any] = {"": {}, ", R = 0.5": PRESETS["noisy"], ", hard": PRESETS["hard"]}
 
 Case = tuple[Callable[[], object], int]  # a function, and its steps
@@ -43,54 +43,72 @@ def work(options: Options) -> str:
 
     with blame("--device"):
         for n in ON_DEVICE if options.device else BATCHES:
-            cases = {name: stepping(env) for name, env in made(n, options.device).items()}
+            environments = make_environments(n, options.device)
+            cases = {name: stepping(envs) for name, envs in environments.items()}
             print(f"\nn = {n:,}\n{on_screen(compare(cases, options.rounds))}", flush=True)
     return f"Medians of {options.rounds} rounds; in parentheses, 10th to 90th percentile."
 
 
-def made(n: int, device: str | None) -> dict[str, Any]:
-    """Return one environment of each kind or batches of n; on a device, those of PyTorch."""
+def make_environments(n: int, device: str | None) -> dict[str, Any]:
+    """Return environments with n plants by their names in the table.
+
+    Without a device, these are CartPole and the plants in NumPy and, if it is installed, in
+    PyTorch. With a device, these are the plants in PyTorch alone.
+    """
     if n == 1:
         return {name: gymnasium.make(name) for name in (REFERENCE, PLANT)}
-    found: dict[str, Any] = {}
+    environments: dict[str, Any] = {}
     if device is None:
         make = partial(gymnasium.make_vec, num_envs=n, vectorization_mode="vector_entry_point")
-        found = {REFERENCE: make(REFERENCE)}
-        found |= {PLANT + name: make(PLANT, **each) for name, each in PLANTS.items()}
+        environments[REFERENCE] = make(REFERENCE)
+        for name, arguments in PLANTS.items():
+            environments[PLANT + name] = make(PLANT, **arguments)
     if device or importlib.util.find_spec("torch"):
         import torch
 
         from mptc_gym.torch_env import MiddlePointTorchEnv
 
         torch.set_num_threads(1)  # one core, as for the others
-        on_device = partial(MiddlePointTorchEnv, n, device=device or "cpu")
-        found |= {f"in PyTorch{name}": on_device(**each) for name, each in PLANTS.items()}
-    return found
+        make_on_device = partial(MiddlePointTorchEnv, n, device=device or "cpu")
+        for name, arguments in PLANTS.items():
+            environments[f"in PyTorch{name}"] = make_on_device(**arguments)
+    return environments
 
 
 def stepping(envs: Any) -> Case:
-    """Return the case of environments: steps and the resets that they need, all awaited."""
-    wait: Callable[[], object] = list
+    """Return a case: a function that steps the environments and resets them where needed.
+
+    The function returns when the device has finished.
+    """
+    is_single = isinstance(envs, gymnasium.Env)
+    if is_single:
+        steps = 10 * EPISODE
+        distinct_actions = EPISODE
+        plants = 1
+    else:
+        steps = EPISODE + 1  # and the reset after an episode
+        distinct_actions = 20
+        plants = envs.num_envs
     envs.reset(seed=0)
     envs.action_space.seed(0)
-    one = isinstance(envs, gymnasium.Env)
-    steps = 10 * EPISODE if one else EPISODE + 1
-    actions = [envs.action_space.sample() for _ in range(EPISODE if one else 20)]
+    actions = [envs.action_space.sample() for _ in range(distinct_actions)]
+    wait: Callable[[], object] = list  # does nothing
     if hasattr(envs, "device"):
         import torch
 
-        actions = [torch.as_tensor(each, device=envs.device) for each in actions]
-        wait = torch.accelerator.synchronize if envs.device.type != "cpu" else list
+        actions = [torch.as_tensor(action, device=envs.device) for action in actions]
+        if envs.device.type != "cpu":
+            wait = torch.accelerator.synchronize
 
     def run() -> None:
         for k in range(steps):
             _, _, terminated, truncated, _ = envs.step(actions[k % len(actions)])
-            if one and (terminated or truncated):
+            if is_single and (terminated or truncated):
                 envs.reset()
         wait()
 
     envs.step(actions[0])  # the first is slow on a device
-    return run, steps * (1 if one else envs.num_envs)
+    return run, steps * plants
 
 
 def compare(cases: Mapping[str, Case], rounds: int) -> Any:
@@ -102,11 +120,11 @@ def compare(cases: Mapping[str, Case], rounds: int) -> Any:
 
     seconds = []
     for _ in range(rounds):
-        clock = [time.perf_counter()]
+        times = [time.perf_counter()]
         for run, _ in cases.values():
             run()
-            clock.append(time.perf_counter())
-        seconds.append(np.diff(clock))
+            times.append(time.perf_counter())
+        seconds.append(np.diff(times))
     rates = pd.DataFrame([steps for _, steps in cases.values()] / np.array(seconds))
     low, ratio, high = (
         rates.div(rates[0], axis="index").quantile(share).map("{:.2f}".format)

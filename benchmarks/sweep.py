@@ -136,7 +136,9 @@ def work(options: Options) -> str:
 def design(options: Options, nominal: Arguments) -> list[Arguments]:
     """Return the arguments in which the plants of the design differ from the nominal one."""
     gains = np.linspace(0.75, 1.65, 10).round(6).tolist()
-    plants = [{"delay": at, "gain_factor": gain} for gain in gains for at in range(2, 42, 2)]
+    plants: list[Arguments] = [
+        {"delay": delay, "gain_factor": gain} for gain in gains for delay in range(2, 42, 2)
+    ]
     if options.design == "random":
         plants = random_design(options.plants or 200, options.design_seed or 0, SAMPLES)
     elif options.plants or options.design_seed is not None:
@@ -149,10 +151,14 @@ def design(options: Options, nominal: Arguments) -> list[Arguments]:
 
 
 def run_agent(
-    controller: ControllerSpec, told: Arguments, case: Arguments, runs: int
+    controller: ControllerSpec, prior: Arguments, case: Arguments, runs: int
 ) -> dict[str, Any]:
-    """Run a controller that is made for the plant it is `told` on another one; measure it."""
-    agent = controller.in_service(told, runs, SEED)
+    """Run a controller on a plant, and return its measures, each of shape (runs,).
+
+    `prior` are the arguments of the plant for which the controller is made, and `case` those of
+    the plant on which it runs.
+    """
+    agent = controller.in_service(prior, runs, SEED)
     trajectory = controller.run(case, SAMPLES, runs, SEED, agent)
     measures = measure(trajectory, Parameters(**case))
     return {"run": np.arange(runs), **measures, "swing": swing(trajectory)}
@@ -169,42 +175,53 @@ def scale_of(case: Arguments, runs: int) -> dict[str, Any]:
 
 
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Return the rms of the error's deviations in the second half of each hold, (runs,)."""
-    error = trajectory.setpoint - trajectory.output
-    holds = held(trajectory.setpoint[:, 0])
-    variances = [error[(start + stop) // 2 : stop].var(axis=0) for start, stop in holds]
+    """Return the error's standard deviation on steady stretches, degC, shape (runs,).
+
+    These are the second halves of the stretches of constant set point.
+    """
+    errors = trajectory.setpoint - trajectory.output
+    variances = [
+        errors[(start + stop) // 2 : stop].var(axis=0)
+        for start, stop in held(trajectory.setpoint[:, 0])
+    ]
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))
 
 
 def table(
-    plants: Sequence[Arguments], agents: Sequence[str], found: Mapping[str, Any]
+    plants: Sequence[Arguments], agents: Sequence[str], results: Mapping[str, Any]
 ) -> pd.DataFrame:
-    """Return one row for each run that there is: its plant, its measures, its comparisons."""
+    """Return one row for each run that has finished: its plant, measures and comparisons.
+
+    `results` are the measures by the name of the task, of `scale_of` and `run_agent`.
+    """
     import pandas as pd
 
-    rows = [pd.DataFrame()]
+    tables = [pd.DataFrame()]
     for (i, plant), agent in itertools.product(enumerate(plants), agents):
-        idle, of = found.get(f"plant {i}"), found.get(f"plant {i}, {agent}")
-        if idle and of:
-            compared = {  # with no control in the same noise
+        idle = results.get(f"plant {i}")
+        measures = results.get(f"plant {i}, {agent}")
+        if idle and measures:
+            comparisons = {  # with no control in the same noise
                 "limit": idle["limit"],
-                "ratio": of["mae"] / idle["limit"],
-                "oscillates": of["swing"] > idle["swing"] + OSCILLATES,
-                "useless": of["mae"] >= idle["mae"],
+                "ratio": measures["mae"] / idle["limit"],
+                "oscillates": measures["swing"] > idle["swing"] + OSCILLATES,
+                "useless": measures["mae"] >= idle["mae"],
             }
-            rows.append(pd.DataFrame({"plant": i, "agent": agent, **of, **compared, **plant}))
-    return pd.concat(rows, ignore_index=True)
+            columns = {"plant": i, "agent": agent, **measures, **comparisons, **plant}
+            tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     """Return one row of numbers for each controller; see `TEXT`."""
-    of = runs.groupby("agent", sort=False)
-    found = 100.0 * of[["oscillates", "useless"]].mean()
-    found.insert(0, "travel", of["total_variation"].median())
+    by_agent = runs.groupby("agent", sort=False)
+    summary = 100.0 * by_agent[["oscillates", "useless"]].mean()
+    summary.insert(0, "travel", by_agent["total_variation"].median())
+    # Of the median run on each plant.
     ratios = runs.groupby(["agent", "plant"], sort=False)["ratio"].median().groupby("agent")
-    found.insert(0, "multiple_p90", ratios.quantile(0.9))
-    found.insert(0, "multiple", ratios.median())
-    return found.reset_index()
+    summary.insert(0, "multiple_p90", ratios.quantile(0.9))
+    summary.insert(0, "multiple", ratios.median())
+    return summary.reset_index()
 
 
 def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) -> None:
@@ -225,7 +242,10 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) 
 
 
 def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:
-    """Return a row for each group of two plants and more on which none failed."""
+    """Return a table of differences of the mean error, degC, with a row for each group.
+
+    Groups are those of `GROUPS` with at least two plants on which all controllers finished.
+    """
     import pandas as pd
 
     from benchmarks.lib.statistics import bootstrap
@@ -234,13 +254,16 @@ def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.Data
     errors = runs.pivot(index="plant", columns=["agent", "run"], values="mae")[agents].dropna()
     plants = runs.drop_duplicates("plant").set_index("plant").loc[errors.index]
     rows = []
-    for name, which in GROUPS.items():
-        of = errors.loc[plants.query(which).index]
-        if len(of) > 1:
-            rows.append({"plants": name, "number": str(len(of))})
-            for ours, theirs in pairs:
-                difference = bootstrap((of[ours] - of[theirs]).to_numpy(), seed=SEED)
-                rows[-1][f"{label(ours)} - {label(theirs)}"] = f"{difference:+.3f}"
+    for name, condition in GROUPS.items():
+        errors_of_group = errors.loc[plants.query(condition).index]
+        if len(errors_of_group) < 2:
+            continue
+        row = {"plants": name, "number": str(len(errors_of_group))}
+        for first, second in pairs:
+            differences_of_runs = errors_of_group[first] - errors_of_group[second]
+            estimate = bootstrap(differences_of_runs.to_numpy(), seed=SEED)
+            row[f"{label(first)} - {label(second)}"] = f"{estimate:+.3f}"
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -251,24 +274,27 @@ def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     from benchmarks.lib.report import MULTIPLE, panels, scale_by_excess
 
     centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
-    look: Any = {"marker": "s", "cmap": "cividis_r", "norm": LogNorm(0.01, 3.0)}
+    square_style: Any = {"marker": "s", "cmap": "cividis_r", "norm": LogNorm(0.01, 3.0)}
     names = list(runs["agent"].unique())
     with panels(path, [*map(label, names)], 2.3, 3, PICTURE) as (figure, axes):
         for panel, name in zip(axes, names, strict=True):
             plants = runs[runs["agent"] == name].groupby("plant")
             delay, gain = plants["delay"].first(), plants["gain_factor"].first()
             excess = plants["ratio"].median().sub(1.0).clip(lower=0.01)
-            image = panel.scatter(delay, gain, 20, excess, **look)
-            often = plants["oscillates"].mean() >= 0.5
-            panel.plot(delay[often], gain[often], "wo", ms=3.5, mec="k", label="oscillates")
-            often = plants["useless"].mean() >= 0.5
-            panel.plot(delay[often], gain[often], "rX", label="no better than no control")
+            image = panel.scatter(delay, gain, 20, excess, **square_style)
+            # Where this holds for at least half of the runs.
+            oscillates = plants["oscillates"].mean() >= 0.5
+            useless = plants["useless"].mean() >= 0.5
+            panel.plot(
+                delay[oscillates], gain[oscillates], "wo", ms=3.5, mec="k", label="oscillates"
+            )
+            panel.plot(delay[useless], gain[useless], "rX", label="no better than no control")
             panel.plot(*centre, "k+", ms=12, label="the nominal plant")
         for panel in axes[-3:]:
             panel.set_xlabel("delay (samples)")
         figure.supylabel("gain factor", fontsize="medium")
-        below: Any = {"location": "bottom", "aspect": 60, "extend": "both"}
-        bar = figure.colorbar(image, ax=axes, label=MULTIPLE, **below)
+        bar_style: Any = {"location": "bottom", "aspect": 60, "extend": "both"}
+        bar = figure.colorbar(image, ax=axes, label=MULTIPLE, **bar_style)
         scale_by_excess(bar.ax, "x", 0.013, 3.0 / 1.3)
         figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=4)
 

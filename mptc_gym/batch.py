@@ -1,7 +1,7 @@
 """Implement what the vector environments share: arguments, masks, time limits, resets, infos.
 
-`MiddlePointVectorEnv` adds the motion of plants in NumPy arrays, and `MiddlePointTorchEnv` in
-PyTorch tensors.
+`MiddlePointVectorEnv` adds the plants in NumPy arrays, and `MiddlePointTorchEnv` in PyTorch
+tensors.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ FACTORS = ("gain_factor", "time_constant_factor")
 
 
 class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
-    """n plants that advance together, without what depends on the array library."""
+    """n plants that advance together: the part that does not depend on the array library."""
 
     _where: Any  # numpy.where or torch.where
-    _shown: Any  # the observations: `present()` returns them, and the caller may overwrite them
-    _zeros: Array  # one per plant, read-only
+    _shown: Any  # the observations; `present()` returns copies of them
+    _zeros: Array  # shape (num_envs,), read-only
 
     def __init__(
         self,
@@ -60,15 +60,20 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         self.single_observation_space = observation_space(self.parameters)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._factor_names = FACTORS if self.parameters.drifts else ()
-        load = ("disturbance",) if self.parameters.is_disturbed else ()
-        self._names = (*INFO, *load, *self._factor_names)  # keys of the infos
+        # Keys of the infos of every step, and of their masks.
+        names = [*INFO]
+        if self.parameters.is_disturbed:
+            names.append("disturbance")
+        self._factor_names: tuple[str, ...] = ()
+        if self.parameters.drifts:
+            self._factor_names = FACTORS
+        self._names = (*names, *self._factor_names)
         self._masks = tuple(f"_{name}" for name in self._names)
-        # Each plant's k is the clock minus its start.
+        # Steps of the environment. A plant's k is the clock minus the start of its episode.
         self._clock = 0
         self._starts = np.zeros(num_envs, np.int64)
-        self._first_end = 0  # until the first reset
-        self._ended: Mask | None = None  # plants still to be reset, if any
+        self._first_end = 0  # the clock when an episode ends next; 0 before the first reset
+        self._ended: Mask | None = None  # plants whose episode has ended; None for no plant
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -81,10 +86,22 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             Restarts the random numbers; see the class docstring. Without it, they continue.
         options
             `reset_mask`, a bool array of shape (num_envs,), selects the plants to reset. The
-            first reset must include all. Plants that are not reset return their last
-            observation, and are False in the infos' masks, which may be one array.
+            first reset must include all plants.
 
-        An argument that is invalid is a ValueError; nothing is then changed.
+        Returns
+        -------
+        observations : array
+            Shape (num_envs, size). Those of plants that are not reset are their last ones.
+        infos : dict
+            Arrays of shape (num_envs,), and their masks, which are False for plants that are
+            not reset. Several masks may be the same array.
+
+        Raises
+        ------
+        ValueError
+            If an argument is invalid. Nothing is then changed.
+        ResetNeeded
+            If the first reset does not include all plants.
         """
         if options is not None and not isinstance(options, Mapping):
             reject("options", options, "a dict or None")
@@ -96,12 +113,28 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         return self._shown.present(), infos
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
-        """Apply normalised actions, shape (num_envs, 1), for one sample.
+        """Apply normalised actions for one sample.
 
-        Returns observations, shape (num_envs, size), then rewards, terminations,
-        truncations and infos, shape (num_envs,). The masks of the infos may be one array.
-        Actions of another shape or not finite are a ValueError; nothing is then changed. Plants
-        never reset or, with autoreset disabled, ended plants raise a `ResetNeeded`.
+        Parameters
+        ----------
+        actions
+            Shape (num_envs, 1).
+
+        Returns
+        -------
+        observations : array
+            Shape (num_envs, size).
+        rewards, terminations, truncations : array
+            Shape (num_envs,). No episode terminates.
+        infos : dict
+            Arrays of shape (num_envs,), and their masks. Several masks may be the same array.
+
+        Raises
+        ------
+        ValueError
+            If the actions have another shape or are not finite. Nothing is then changed.
+        ResetNeeded
+            Before the first reset; with autoreset disabled, also if an episode has ended.
         """
         if not self._first_end:
             raise ResetNeeded("call reset before step")
@@ -111,53 +144,65 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             raise ResetNeeded(f"episodes of environments {which} have ended: reset them")
         a = self._checked_actions(actions)
         if ended is not None and ended.all():
-            infos, nobody = self._restart(ended, {}), [self._flags(~ended) for _ in range(2)]
-            return self._shown.present(), self._zeros + 0, *nobody, infos
+            infos = self._restart(ended, {})
+            rewards = self._zeros + 0  # a copy
+            terminations = self._flags(~ended)
+            truncations = self._flags(~ended)
+            return self._shown.present(), rewards, terminations, truncations, infos
         self._clock += 1
-        returned = self._advance(a)
-        return returned if self._clock < self._first_end else self._end(*returned)
+        step = self._advance(a)
+        if self._clock < self._first_end:
+            return step
+        return self._end_episodes(*step)
 
-    def _end(
-        self, observations: Array, rewards: Array, nobody: Array, _: Array, infos: Infos
+    def _end_episodes(
+        self, observations: Array, rewards: Array, terminations: Array, _: Array, infos: Infos
     ) -> tuple[Array, Array, Array, Array, Infos]:
-        """Handle the end of episodes in what a step returns."""
+        """Return what a step returns, where episodes end or have ended at the previous step.
+
+        The arguments are what it would return if no episode ended.
+        """
         ended = self._clock - self._starts >= self._limit
-        flags = self._flags(ended)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            final = {name: self._where(flags, infos[name], 0) for name in self._names}
-            final |= dict.fromkeys(self._masks, flags)
-            infos |= {"final_info": final, "final_obs": self._final(ended, observations)}
-            infos |= {"_final_info": flags, "_final_obs": flags}
+            flags = self._flags(ended)
+            final_info = {name: self._where(flags, infos[name], 0) for name in self._names}
+            final_info |= dict.fromkeys(self._masks, flags)
+            infos["final_info"] = final_info
+            infos["_final_info"] = flags
+            infos["final_obs"] = self._final(ended, observations)
+            infos["_final_obs"] = flags
             self._restart(ended, infos)
-            return self._shown.present(), rewards, nobody, self._flags(ended), infos
-        if self._ended is not None:  # at the previous step
+            return self._shown.present(), rewards, terminations, self._flags(ended), infos
+        if self._ended is not None:  # since the previous step: this step resets them
             rewards = self._where(self._flags(self._ended), 0, rewards)
             self._restart(self._ended, infos)
             observations = self._shown.present()
             ended = self._clock - self._starts >= self._limit
         self._ended = ended if ended.any() else None
-        return observations, rewards, nobody, self._flags(ended), infos
+        return observations, rewards, terminations, self._flags(ended), infos
 
     def _restart(self, mask: Mask, infos: Infos) -> Infos:
-        """Begin an episode of some plants, and return the infos with theirs at k = 0."""
+        """Begin an episode of some plants; put their infos at k = 0 in the infos of a step."""
         self._starts[mask] = self._clock
         self._first_end = int(self._starts.min()) + self._limit
         if self._ended is not None:
-            left = self._ended & ~mask
-            self._ended = left if left.any() else None
-        flags, first = self._flags(mask), self._begin(mask)
-        for name in {*self._names, *first}:
-            values = first.get(name, self._zeros)
+            still_ended = self._ended & ~mask
+            self._ended = still_ended if still_ended.any() else None
+        flags = self._flags(mask)
+        first_infos = self._begin(mask)
+        for name in {*self._names, *first_infos}:
+            values = first_infos.get(name, self._zeros)
             infos[name] = self._where(flags, values, infos.get(name, 0))
             infos.setdefault(f"_{name}", flags)
         return infos
 
     def _checked_mask(self, options: Mapping[str, Any]) -> Mask:
-        """Return the mask of the plants to reset."""
+        """Return the mask of the plants to reset: all, unless the options say otherwise."""
         if "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
-        given = options["reset_mask"]
-        mask = given.cpu().numpy() if hasattr(given, "cpu") else given  # of tensors
+        mask = options["reset_mask"]
+        if hasattr(mask, "cpu"):  # a tensor
+            mask = mask.cpu().numpy()
         if (
             not isinstance(mask, np.ndarray)
             or mask.dtype != np.bool_
@@ -165,7 +210,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             or not mask.any()
         ):
             allowed = f"an array of bool, shape ({self.num_envs},), at least one of them True"
-            reject("options['reset_mask']", given, allowed)
+            reject("options['reset_mask']", options["reset_mask"], allowed)
         return mask.copy()
 
     @abstractmethod
@@ -178,11 +223,17 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
 
     @abstractmethod
     def _begin(self, mask: Mask) -> dict[str, Array]:
-        """Begin an episode of some plants; return their infos at k = 0 that are not 0."""
+        """Begin an episode of some plants; return those of their infos at k = 0 that are not 0.
+
+        The arrays have the shape (num_envs,); only the elements of these plants are used.
+        """
 
     @abstractmethod
     def _checked_actions(self, actions: Any) -> Array:
-        """Return the actions, shape (num_envs,); 0 where they are ignored."""
+        """Return the actions, shape (num_envs,); 0 for plants whose episode has ended.
+
+        A ValueError is raised for actions of another shape and for those that are not finite.
+        """
 
     @abstractmethod
     def _advance(self, a: Array) -> tuple[Array, Array, Array, Array, Infos]:
@@ -190,4 +241,4 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
 
     @abstractmethod
     def _final(self, ended: Mask, observations: Array) -> Array:
-        """Return `final_obs`, given the plants whose episode has ended."""
+        """Return `final_obs`: the observations of plants whose episode has just ended."""

@@ -20,12 +20,12 @@ SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
 _COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # faster to pass than the type
-_SHOWN = 80  # characters of a value shown in an error message
-# What arrays, tensors and Python raise if a value is no number.
-_NO_NUMBER = TypeError, ValueError, OverflowError, RuntimeError
+_LONGEST_REPR = 80  # characters of a value in an error message
+# What arrays, tensors and Python raise if a value is not a number.
+_NOT_A_NUMBER = TypeError, ValueError, OverflowError, RuntimeError
 
-Number = float | Sequence[float]  # or a range, [low, high]
-Check = Callable[[str, Any], Any]
+Number = float | Sequence[float]  # a number, or a range [low, high]
+Check = Callable[[str, Any], Any]  # of an argument's name and value; see `mptc_gym.parameters`
 
 
 def reject(name: str, value: object, allowed: str) -> NoReturn:
@@ -36,18 +36,29 @@ def reject(name: str, value: object, allowed: str) -> NoReturn:
 def shorten(value: object) -> str:
     """Return the repr of a value; for a long one, its beginning and its length."""
     text = repr(value)
-    size = f" ({len(value)} elements)" if isinstance(value, list | tuple) else ""
-    if hasattr(value, "shape"):  # an array or a tensor, printed in several lines
-        text, size = " ".join(text.split()), f" (shape {tuple(value.shape)})"
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...{size}"
+    length = ""
+    if isinstance(value, list | tuple):
+        length = f" ({len(value)} elements)"
+    if hasattr(value, "shape"):  # an array or a tensor, whose repr has several lines
+        text = " ".join(text.split())
+        length = f" (shape {tuple(value.shape)})"
+    if len(text) <= _LONGEST_REPR:
+        return text
+    return f"{text[:_LONGEST_REPR]}...{length}"
 
 
 def one_action(action: Any) -> float:
-    """Return the action of one plant."""
+    """Return the action of one plant, given as one number or an array of one number.
+
+    Raises
+    ------
+    ValueError
+        If the action is not one finite number.
+    """
     try:
-        value = action.item() if hasattr(action, "item") else np.asarray(action).item()
-        checked = float(value - 0.0)  # text is not a number, even if float() parses it
-    except _NO_NUMBER:
+        array = action if hasattr(action, "item") else np.asarray(action)
+        checked = float(array.item() - 0.0)  # text is not a number, even if float() parses it
+    except _NOT_A_NUMBER:
         checked = math.nan
     if not math.isfinite(checked):
         reject("action", action, "one finite number, shape (1,)")
@@ -57,19 +68,32 @@ def one_action(action: Any) -> float:
 def many_actions(
     actions: Any, num_envs: int, ignored: NDArray[np.bool_] | None
 ) -> NDArray[np.float64]:
-    """Return the actions of many plants in a new array, shape (num_envs,); 0 if ignored."""
-    given: NDArray[Any]
-    try:
-        given = np.asarray(actions)
-        if given.dtype.hasobject:
-            given = np.array((given - 0.0).tolist())
-        # Text is not a number, even if NumPy parses it.
-        given = given.astype(_FLOAT64, casting="same_kind")
-    except _NO_NUMBER:
-        given = np.empty(0)
-    if given.shape != (num_envs, 1):
+    """Return the actions of many plants in a new array.
+
+    Parameters
+    ----------
+    actions
+        Numbers, shape (num_envs, 1).
+    num_envs
+        Number of plants.
+    ignored
+        Plants whose actions are ignored, shape (num_envs,): their actions are returned as 0,
+        and need not be finite. None if no action is ignored.
+
+    Returns
+    -------
+    ndarray of float64
+        The actions, shape (num_envs,).
+
+    Raises
+    ------
+    ValueError
+        If the actions have another shape, or if one is not a finite number.
+    """
+    columns = _as_float64(actions)
+    if columns is None or columns.shape != (num_envs, 1):
         reject("actions", actions, f"numbers, shape ({num_envs}, 1)")
-    checked = given.ravel()
+    checked = columns.ravel()
     if ignored is not None:
         checked[ignored] = 0.0
     # One call shows that all are finite, unless some are huge.
@@ -78,11 +102,31 @@ def many_actions(
     return checked
 
 
+def _as_float64(values: Any) -> NDArray[np.float64] | None:
+    """Return numbers in a new float64 array, or None if some are not real numbers."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.hasobject:
+            array = np.array((array - 0.0).tolist())
+        # Text is not a number, even if NumPy parses it.
+        return array.astype(_FLOAT64, casting="same_kind")
+    except _NOT_A_NUMBER:
+        return None
+
+
 def plain(value: Any) -> Any:
-    """Return NumPy arrays and scalars, also those in a list, as lists and numbers."""
+    """Return an array as a list, and NumPy scalars, also in a list, as Python numbers."""
     if isinstance(value, list | tuple):
-        return type(value)(v.tolist() if isinstance(v, np.generic) else v for v in value)
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        return type(value)(_plain_scalar(element) for element in value)
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return _plain_scalar(value)
+
+
+def _plain_scalar(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    return value
 
 
 def is_number(value: Any) -> bool:
@@ -98,7 +142,7 @@ def is_count(value: Any, minimum: int = 0) -> bool:
 
 
 def number(name: str, value: Any, low: float = -LARGEST, allowed: str | None = None) -> float:
-    """Return a number of at least `low`, never -0."""
+    """Return a number of at least `low` as a float, never -0."""
     if not is_number(value) or value < low:
         reject(name, value, allowed or f"a number from {low:g} to {LARGEST:g}")
     return float(value) + 0.0
@@ -123,18 +167,20 @@ duration = partial(count, minimum=1, maximum=LARGEST)  # in samples
 def numbers(
     name: str, value: Any, allowed: str = _COEFFICIENTS, most: float = MOST_COEFFICIENTS
 ) -> tuple[float, ...]:
-    """Return the numbers of a list that has 1 to `most`."""
+    """Return the numbers of a list that has 1 to `most` elements."""
     if not isinstance(value, list | tuple) or not 0 < len(value) <= most:
         reject(name, value, allowed)
     for i, element in enumerate(value):
         if not is_number(element):
-            where = f"{shorten(value)}, where element {i} is {shorten(element)}"
-            raise ValueError(f"{name} must be {allowed}, got {where}")
+            raise ValueError(
+                f"{name} must be {allowed}, got {shorten(value)}, where element {i} is "
+                f"{shorten(element)}"
+            )
     return tuple(map(float, value))
 
 
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
-    """Return coefficients, the first of which is 1."""
+    """Return the coefficients of a polynomial, the first of which must be 1."""
     allowed = f"{_COEFFICIENTS}, the first of them 1"
     checked = numbers(name, value, allowed)
     if checked[0] != 1.0:
@@ -143,7 +189,7 @@ def polynomial(name: str, value: Any) -> tuple[float, ...]:
 
 
 def one_of(name: str, value: Any, choices: Sequence[str | None]) -> Any:
-    """Return one of some texts; None, too, may be among them."""
+    """Return a text that is one of the choices. None can be a choice."""
     if not isinstance(value, str | None) or value not in choices:
         reject(name, value, " or ".join(map(repr, choices)))
     return value
@@ -153,7 +199,7 @@ reward = partial(one_of, choices=REWARDS)
 
 
 def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
-    """Return a kind of set point, a constant, or one number per sample."""
+    """Return a set point: one of `SETPOINTS`, a constant, or one number per sample."""
     allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
     if isinstance(value, list | tuple):
         return numbers(name, value, allowed, math.inf)
@@ -163,10 +209,10 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
 
 
 def or_range(check: Callable[[str, Any], float], name: str, value: Any) -> Number:
-    """Return what `check` takes, or a range [low, high] of it."""
+    """Return a number that passes `check`, or a range (low, high) of such numbers."""
     if not isinstance(value, list | tuple):
         return check(name, value)
-    ends = [check(name, each) for each in value]
+    ends = [check(name, end) for end in value]
     if len(ends) != 2 or ends[0] > ends[1]:
         reject(name, value, "one number, or a range [low, high] with low <= high")
     return ends[0], ends[1]

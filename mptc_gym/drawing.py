@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from itertools import chain, pairwise
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
@@ -17,90 +17,137 @@ except ImportError as error:
 
 from mptc_gym.record import Record
 
-Colour = tuple[int, int, int]
-Place = tuple[int, int, int, int]  # pixels from the left edge, from the top, width and height
+Colour = tuple[int, int, int]  # red, green and blue, 0 to 255
 
-SIZE = 960, 540
+SIZE = 960, 540  # of the picture: width and height, pixels
 # The lines have the colours of Okabe and Ito, safe for colour-blind readers.
-TEMPERATURE, SETPOINT = (0, 114, 178), (213, 94, 0)
-APPLIED, COMMAND = (0, 158, 115), (40, 40, 40)
-DEAD_ZONE, IN_TRANSIT = (222, 222, 222), (205, 229, 246)
-LIMIT, _GRID, _INK, _PAPER = (130, 130, 130), (236, 237, 240), (60, 64, 70), (255, 255, 255)
-TEMPERATURES, FLOWS = (72, 44, 864, 214), (72, 324, 864, 182)  # places of the panels
+TEMPERATURE = (0, 114, 178)
+SETPOINT = (213, 94, 0)
+APPLIED = (0, 158, 115)
+COMMAND = (40, 40, 40)
+DEAD_ZONE = (222, 222, 222)
+IN_TRANSIT = (205, 229, 246)
+LIMIT = (130, 130, 130)
+_GRID = (236, 237, 240)
+_INK = (60, 64, 70)
+_PAPER = (255, 255, 255)
 clock = pygame.time.Clock()  # limits the frame rate
 
 
+class Place(NamedTuple):
+    """Where a panel lies in the picture, in pixels from its upper left corner."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+class Label(NamedTuple):
+    """A text in its colour, on a ground of another colour."""
+
+    text: str
+    colour: Colour
+    ground: Colour = _PAPER
+
+
+TEMPERATURES = Place(72, 44, 864, 214)
+FLOWS = Place(72, 324, 864, 182)
+
+
 class Panel:
-    """A part of the picture with its own axes."""
+    """A part of the picture with its own axes.
+
+    `axis` holds the lower and the upper end of the vertical axis. The horizontal axis shows the
+    samples of the record, with numbers in minutes.
+    """
 
     def __init__(
         self, surface: pygame.Surface, record: Record, place: Place, axis: tuple[float, float]
     ) -> None:
-        self._surface, self._record, self._axis = surface, record, axis
-        self._left, self._top, self._width, self._height = place
+        self._surface = surface
+        self._record = record
+        self._place = place
+        self._axis = axis
         self._font = pygame.font.Font(None, 22)
 
     def x(self, k: float) -> float:
         """Return the horizontal position of sample k."""
-        return self._left + (k - self._record.first) * self._width / self._record.span
+        samples = k - self._record.first
+        return self._place.left + samples * self._place.width / self._record.span
 
     def y(self, value: float) -> float:
         """Return the vertical position of a value, at the panel's edge if it is beyond."""
         low, high = self._axis
-        below_top = (high - value) / (high - low) * self._height
-        # Inside the frame; so is NaN, given this order of min and max.
-        return self._top + max(3.0, min(self._height - 3.0, below_top))
+        below_top = (high - value) / (high - low) * self._place.height
+        # 3 pixels inside the frame. By this order of min and max, NaN is at the lower edge.
+        return self._place.top + max(3.0, min(self._place.height - 3.0, below_top))
 
     def grid(self) -> None:
         """Draw grid and frame, and write the numbers of both axes."""
+        left, top, width, height = self._place
+        bottom = top + height
         for value in ticks(*self._axis):
             self.level(_GRID, value)
-            self.write(f"{value:.6g}", _INK, midright=(self._left - 8, self.y(value)))
-        minute, first = 60.0 / self._record.sampling_interval, self._record.first  # in samples
-        bottom = self._top + self._height
-        for value in ticks(first / minute, (first + self._record.span) / minute):
-            x = self.x(value * minute)
-            pygame.draw.line(self._surface, _GRID, (x, self._top), (x, bottom))
-            self.write(f"{value:.6g}", _INK, midtop=(x, bottom + 6))
-        # Left of where a number at the edge begins.
-        self.write("min", _INK, topright=(self._left - 34, bottom + 6))
-        frame = self._left, self._top, self._width + 1, self._height + 1
-        pygame.draw.rect(self._surface, LIMIT, frame, 1)
+            self.write(f"{value:.6g}", _INK, midright=(left - 8, self.y(value)))
+        first = self._record.first
+        samples_per_minute = 60.0 / self._record.sampling_interval
+        last = first + self._record.span
+        for minutes in ticks(first / samples_per_minute, last / samples_per_minute):
+            x = self.x(minutes * samples_per_minute)
+            pygame.draw.line(self._surface, _GRID, (x, top), (x, bottom))
+            self.write(f"{minutes:.6g}", _INK, midtop=(x, bottom + 6))
+        # To the left of a number at the edge.
+        self.write("min", _INK, topright=(left - 34, bottom + 6))
+        pygame.draw.rect(self._surface, LIMIT, (left, top, width + 1, height + 1), 1)
 
     def shade(self, colour: Colour, first: int, last: int, low: float, high: float) -> None:
-        """Shade what lies between two samples and two values."""
-        left, top = max(self._left, round(self.x(first))), round(self.y(high))
-        area = left, top, round(self.x(last)) - left, round(self.y(low)) - top + 1
+        """Shade the area between two samples and two values."""
+        left = max(self._place.left, round(self.x(first)))
+        right = round(self.x(last))
+        top = round(self.y(high))
+        bottom = round(self.y(low))
+        area = left, top, right - left, bottom - top + 1
         self._surface.fill(colour, area, pygame.BLEND_RGB_MULT)
 
     def level(self, colour: Colour, value: float) -> None:
-        """Draw a line across the panel."""
+        """Draw a horizontal line across the panel."""
         y = self.y(value)
-        pygame.draw.line(self._surface, colour, (self._left, y), (self._left + self._width, y))
+        right = self._place.left + self._place.width
+        pygame.draw.line(self._surface, colour, (self._place.left, y), (right, y))
 
     def curve(self, colour: Colour, values: Sequence[float], width: int, *, held: bool) -> None:
-        """Draw the latest values; if held, each from its sample to the next."""
+        """Draw the latest values, the newest last; if held, as steps from sample to sample."""
         first = self._record.k + 1 - len(values)
-        points = [(self.x(k), self.y(value)) for k, value in enumerate(values, start=first)]
-        if held:
-            corners = [(after[0], before[1]) for before, after in pairwise(points)]
-            points = [*chain.from_iterable(zip(points, corners, strict=False)), points[-1]]
+        points: list[tuple[float, float]] = []
+        for k, value in enumerate(values, start=first):
+            x = self.x(k)
+            y = self.y(value)
+            if held and points:
+                _, previous_y = points[-1]
+                points.append((x, previous_y))
+            points.append((x, y))
         if len(points) > 1:
             pygame.draw.lines(self._surface, colour, False, points, width)
 
-    def heading(self, *words: tuple[str, Colour, Colour]) -> None:
-        """Write words above the panel, each in its colour and on its ground."""
-        x = self._left
-        for text, colour, ground in words:
-            x = self.write(f" {text} ", colour, ground, midleft=(x, self._top - 16)).right + 12
+    def heading(self, *labels: Label) -> None:
+        """Write labels above the panel, from left to right."""
+        x = self._place.left
+        y = self._place.top - 16
+        for label in labels:
+            box = self.write(f" {label.text} ", label.colour, label.ground, midleft=(x, y))
+            x = box.right + 12
 
     def write(
-        self, text: str, colour: Colour, ground: Colour = _PAPER, **place: tuple[float, float]
+        self, text: str, colour: Colour, ground: Colour = _PAPER, **anchor: tuple[float, float]
     ) -> pygame.Rect:
-        """Write a text with one of its anchors, such as `midleft`, at a point."""
+        """Write a text and return its box.
+
+        `anchor` is one position of the box by its name in pygame, as in `midleft=(x, y)`.
+        """
         image = self._font.render(text.replace("-", "\N{MINUS SIGN}"), True, colour, ground)
-        ((side, (x, y)),) = place.items()
-        return self._surface.blit(image, image.get_rect(**{side: (round(x), round(y))}))
+        ((name, (x, y)),) = anchor.items()
+        return self._surface.blit(image, image.get_rect(**{name: (round(x), round(y))}))
 
 
 def draw(record: Record) -> pygame.Surface:
@@ -109,39 +156,52 @@ def draw(record: Record) -> pygame.Surface:
     # Three bytes per pixel, in the order of an array, so that converting it is just a copy.
     surface = pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
     surface.fill(_PAPER)
-    setpoints, outputs, commands, applied = map(list, zip(*record.samples, strict=True))
+    _draw_temperatures(surface, record)
+    _draw_flows(surface, record)
+    return surface
 
-    panel = Panel(surface, record, TEMPERATURES, record.temperatures)
+
+def _draw_temperatures(surface: pygame.Surface, record: Record) -> None:
+    """Draw the upper panel: temperature and set point."""
+    panel = Panel(surface, record, TEMPERATURES, record.temperature_axis)
     panel.grid()
-    panel.curve(TEMPERATURE, outputs, 3, held=False)
+    panel.curve(TEMPERATURE, [sample.output for sample in record.samples], 3, held=False)
     # Above the temperature, and thinner, so that both can be seen where they agree.
-    panel.curve(SETPOINT, setpoints, 2, held=True)
+    panel.curve(SETPOINT, [sample.setpoint for sample in record.samples], 2, held=True)
+    newest = record.samples[-1]
+    minutes = record.k * record.sampling_interval / 60.0
     panel.heading(
-        (f"temperature {_short(outputs[-1])} °C", TEMPERATURE, _PAPER),
-        (f"set point {_short(setpoints[-1])} °C", SETPOINT, _PAPER),
-        (f"error {_short(setpoints[-1] - outputs[-1])} °C", _INK, _PAPER),
-        (f"time {record.k * record.sampling_interval / 60.0:.2f} min", _INK, _PAPER),
+        Label(f"temperature {_two_decimals(newest.output)} °C", TEMPERATURE),
+        Label(f"set point {_two_decimals(newest.setpoint)} °C", SETPOINT),
+        Label(f"error {_two_decimals(newest.setpoint - newest.output)} °C", _INK),
+        Label(f"time {minutes:.2f} min", _INK),
     )
 
-    plant, (low, high) = record.plant, record.flows
-    panel = Panel(surface, record, FLOWS, record.flows)
+
+def _draw_flows(surface: pygame.Surface, record: Record) -> None:
+    """Draw the lower panel: flows, limits, dead zone, and the time in transit."""
+    plant = record.plant
+    panel = Panel(surface, record, FLOWS, record.flow_axis)
     panel.grid()
     if plant.dead_zone > 0.0:
         last = record.first + record.span
         panel.shade(DEAD_ZONE, record.first, last, -plant.dead_zone, plant.dead_zone)
-    panel.shade(IN_TRANSIT, record.k - int(plant.delay), record.k, low, high)
+    lowest, highest = record.flow_axis
+    panel.shade(IN_TRANSIT, record.k - int(plant.delay), record.k, lowest, highest)
     for limit in (plant.u_min, plant.u_max):
         panel.level(LIMIT, limit)
-    # An input is held from its sample to the next. The first entry is from before the episode.
+    # A sample holds the flows of the step that led to it, so they begin one sample earlier. The
+    # flows of the oldest sample would begin before the picture.
+    applied = [sample.applied for sample in record.samples]
+    commands = [sample.command for sample in record.samples]
     panel.curve(APPLIED, [*applied[1:], applied[-1]], 3, held=True)
     panel.curve(COMMAND, [*commands[1:], commands[-1]], 1, held=True)
     panel.heading(
-        (f"applied flow {_short(applied[-1])} t/h", APPLIED, _PAPER),
-        (f"command {_short(commands[-1])} t/h", COMMAND, _PAPER),
-        ("dead zone", _INK, DEAD_ZONE),
-        ("in transit", _INK, IN_TRANSIT),
+        Label(f"applied flow {_two_decimals(applied[-1])} t/h", APPLIED),
+        Label(f"command {_two_decimals(commands[-1])} t/h", COMMAND),
+        Label("dead zone", _INK, DEAD_ZONE),
+        Label("in transit", _INK, IN_TRANSIT),
     )
-    return surface
 
 
 def frame(record: Record) -> NDArray[np.uint8]:
@@ -164,11 +224,16 @@ def show(record: Record, fps: float) -> None:
 
 def ticks(low: float, high: float) -> list[float]:
     """Return the multiples of 1, 2 or 5 times a power of ten in a range, 3 to 7 of them."""
-    least = (high - low) / 6.0
-    power = 10.0 ** math.floor(math.log10(least))
-    step = next(power * by for by in (1.0, 2.0, 5.0, 10.0) if power * by >= least)
+    smallest_step = (high - low) / 6.0
+    power = 10.0 ** math.floor(math.log10(smallest_step))
+    step = next(
+        power * digit for digit in (1.0, 2.0, 5.0, 10.0) if power * digit >= smallest_step
+    )
     return [i * step for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
-def _short(value: float) -> str:
-    return f"{round(value, 2) + 0.0:.2f}" if abs(value) < 1e5 else f"{value:.3g}"  # never -0.00
+def _two_decimals(value: float) -> str:
+    """Return a number with two decimals, never -0.00; a large one with three digits."""
+    if abs(value) < 1e5:
+        return f"{round(value, 2) + 0.0:.2f}"
+    return f"{value:.3g}"

@@ -16,12 +16,13 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym.checks import one_action, one_of, plain
+from mptc_gym.draws import Ranges, Streams, plant_numbers
 from mptc_gym.parameters import Parameters, insert_table, spelt_out
 from mptc_gym.plant import Plant, action_from_command
 from mptc_gym.record import Record
-from mptc_gym.signals import ONE, Ranges, Signals, Streams, plant_numbers
+from mptc_gym.signals import ONE, Signals
 
-INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys, see `reset`
+INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys of every info
 _FLOAT32 = np.dtype(np.float32)  # faster to pass than the type
 _METADATA = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
 
@@ -35,27 +36,33 @@ Action = NDArray[np.float32]
 
 
 def observation_space(parameters: Parameters) -> Space[Observation]:
-    """Return the bounds of the observation, shape (size,), float32.
+    """Return the space of the observation, a `Box` of shape (size,), float32.
 
-    They depend on the set point only if it exceeds the transmitter's range, so that a policy
-    trained on one set point can run on another.
+    Its bounds depend on the set point only if it exceeds the transmitter's range, so that a
+    policy trained on one set point can run on another.
     """
-    span, setpoint = parameters.temperature_span, parameters.setpoint
-    levels = parameters.setpoint_amplitude if isinstance(setpoint, str) else setpoint
-    setpoint_limit = max(span, np.abs(levels).max())
+    span = parameters.temperature_span
+    setpoint = parameters.setpoint
+    if isinstance(setpoint, str):
+        setpoint = parameters.setpoint_amplitude
+    setpoint_limit = max(span, np.abs(setpoint).max())
+    # Of a set point, an error, an output and an action.
     limits = np.array([setpoint_limit, setpoint_limit + span, span, 1.0], np.float32)
     high = np.repeat(limits, parameters.windows)
     return Box(-high, high, dtype=np.float32)
 
 
 class HasPlainSpec:
-    """An environment whose spec holds arrays as lists, as JSON does."""
+    """An environment whose spec holds lists and Python numbers in place of NumPy's.
+
+    So the spec can be written as JSON.
+    """
 
     _spec: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The specification, from which `gymnasium.make` makes the environment again."""
+        """The specification, from which `gymnasium.make` makes such an environment again."""
         return self._spec
 
     @spec.setter
@@ -207,24 +214,26 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     metadata: dict[str, Any] = _METADATA
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
-        self.parameters = parameters = Parameters.of_environment(arguments)
+        parameters = Parameters.of_environment(arguments)
         one_of("render_mode", render_mode, [None, *self.metadata["render_modes"]])
+        self.parameters = parameters
         self.render_mode = render_mode
-        self._record: Record | None = None  # for pictures; None if there are none
+        self._record: Record | None = None  # for pictures; None without a render mode
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)
-        # Used by step, in two tuples: unpacking one is faster than reading as many attributes.
+        # `step` unpacks two tuples, which is faster than reading as many attributes.
         quadratic = parameters.reward == "quadratic"
         self._reward_terms = parameters.error_scale, quadratic, parameters.move_weight
-        # Where errors, outputs and actions begin in the observation, and where it ends.
-        heads = np.cumsum(parameters.windows).tolist()
-        self._layout = parameters.temperature_span, *heads
+        # The places where errors, outputs and actions begin in the observation, and its size.
+        places = np.cumsum(parameters.windows).tolist()
+        self._layout = parameters.temperature_span, *places
         self._ranges = Ranges(parameters)
         self._signals = Signals.of(parameters)
-        self._is_disturbed, self._drifts = parameters.is_disturbed, parameters.drifts
+        self._is_disturbed = parameters.is_disturbed
+        self._drifts = parameters.drifts
         self._has_more_info = self._is_disturbed or self._drifts
-        self._streams: list[Streams] = []  # of the one plant, from the first reset on
-        self._root: np.random.Generator | None = None  # their source
+        self._streams: list[Streams] = []  # of the only plant; empty before the first reset
+        self._root: np.random.Generator | None = None  # from which the streams were spawned
         # y_d, n, w and the measurement noise of the samples ahead, the next one last.
         self._ahead: list[tuple[float, ...]] = []
 
@@ -249,57 +258,78 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             self._root = self.np_random
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
             self._streams = [Streams.spawn(seeds)]
-        parameters = self.parameters
-        drawn = self._ranges.draw(self._streams)
-        setpoint = self._signals.reset(ONE, self._streams, drawn).item()
-        numbers = plant_numbers(drawn, 0)
-        self._plant = Plant(parameters, numbers)
+        numbers_of_plants = self._ranges.draw(self._streams)
+        setpoint = self._signals.reset(ONE, self._streams, numbers_of_plants).item()
+        numbers = plant_numbers(numbers_of_plants, 0)
+        self._plant = Plant(self.parameters, numbers)
+        self._ahead.clear()
 
         # At rest u is 0, whichever action that is.
         self._action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         rest_action = _limited(self._action, 1.0)
-        _, error_head, output_head, action_head, size = self._layout
-        # One spare element at the end: see step.
-        self._window = [0.0] * action_head + [rest_action] * (size - action_head + 1)
-        # In this order, as an empty block begins where the next one does.
-        self._window[0] = self._window[error_head] = setpoint
-        self._window[output_head], self._window[action_head] = 0.0, rest_action
-        self._ahead.clear()
+        _, error_place, output_place, action_place, size = self._layout
+        # `step` needs one more element at the end.
+        self._window = [0.0] * action_place + [rest_action] * (size - action_place + 1)
+        # An empty block begins where the next one does, which is written after it.
+        self._window[0] = setpoint
+        self._window[error_place] = setpoint
+        self._window[output_place] = 0.0
+        self._window[action_place] = rest_action
         if self.render_mode is not None:
-            self._record = Record(numbers, parameters.sampling_interval, setpoint)
+            self._record = Record(numbers, self.parameters.sampling_interval, setpoint)
         if self.render_mode == "human":
             self.render()
         info = dict.fromkeys(INFO, 0.0)
-        info["setpoint"] = info["error"] = setpoint
+        info["setpoint"] = setpoint
+        info["error"] = setpoint
         if self._has_more_info:
             self._add_more_info(info, 0.0)
         info |= numbers.chosen(self._ranges.names)
         return np.fromiter(self._window, _FLOAT32, size), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
-        """Apply a normalised action a(k), shape (1,), for one sample.
+        """Apply a normalised action for one sample.
 
-        Returns observation, reward, terminated, truncated and info at k+1. An action that is
-        not one finite number is a ValueError, which leaves the plant unchanged. Before the
-        first reset, a `ResetNeeded` is raised.
+        Parameters
+        ----------
+        action
+            a(k), shape (1,).
+
+        Returns
+        -------
+        observation : ndarray of float32
+            The observation at k+1, shape (size,).
+        reward : float
+            The reward of e(k+1).
+        terminated, truncated : bool
+            Always False.
+        info : dict of float
+            The info at k+1.
+
+        Raises
+        ------
+        ValueError
+            If the action is not one finite number. The plant is then unchanged.
+        ResetNeeded
+            Before the first reset.
         """
         # This is the hot path: code that runs in every step avoids function calls.
         try:
             a = float(action.item() - 0.0)  # text is not a number, even if float() parses it
         except (AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
             a = one_action(action)
-        shown = a
+        observed_action = a
         if not -1.0 <= a <= 1.0:
-            shown = _limited(a, 1.0)
+            observed_action = _limited(a, 1.0)
             if not math.isfinite(a):
-                one_action(a)  # which refuses it
+                one_action(a)  # raises a ValueError
         if not self._ahead:
             if not self._streams:
                 raise ResetNeeded("call reset before step")
             self._ahead = self._signals.ahead()[::-1]
         setpoint, noise, load, transmitter_noise = self._ahead.pop()
         error_scale, quadratic, move_weight = self._reward_terms
-        span, error_head, output_head, action_head, size = self._layout
+        span, error_place, output_place, action_place, size = self._layout
 
         command, applied, output = self._plant.step(a, noise, load)
         error = setpoint - output
@@ -309,18 +339,19 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             reward -= move_weight * abs(a - self._action)
         self._action = a
 
-        # All blocks shift by one at once; elements that cross into the next are overwritten.
-        # An empty block starts where the next one does, which is written after it, or at the
-        # spare element at the end.
         measured = output + transmitter_noise
         if not -span <= measured <= span:
             measured = _limited(measured, span)
+        # One insertion shifts all blocks by one place. The oldest element of a block moves to
+        # the first place of the next block, where it is overwritten. An empty block begins
+        # where the next one does, which is written after it; an empty last block begins at the
+        # additional element at the end.
         window = self._window
         window.insert(0, setpoint)
         window.pop()
-        window[error_head] = setpoint - measured
-        window[output_head] = measured
-        window[action_head] = shown
+        window[error_place] = setpoint - measured
+        window[output_place] = measured
+        window[action_place] = observed_action
         observation = np.fromiter(window, _FLOAT32, size)  # faster than np.array
         info = {
             "output": output,
@@ -341,9 +372,19 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     def render(self) -> Frame | None:
         """Draw the last minutes of the episode.
 
-        Returns a picture, shape (540, 960, 3), for "rgb_array"; None for "human", which shows
-        it in a window, and, after a warning, without a mode. Raises `ResetNeeded` before the
-        first reset, and `DependencyNotInstalled` without pygame.
+        Returns
+        -------
+        ndarray of uint8 or None
+            With the render mode "rgb_array", a picture, shape (540, 960, 3). With "human",
+            None: the picture is shown in a window. Without a render mode, None, after a
+            warning.
+
+        Raises
+        ------
+        ResetNeeded
+            Before the first reset.
+        DependencyNotInstalled
+            If pygame is not installed.
         """
         if self.render_mode is None:
             logger.warn(NO_MODE)
@@ -366,7 +407,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         self._record = None
 
     def _add_more_info(self, info: dict[str, float], load: float) -> None:
-        """Add the info that belongs to arguments that are off by default."""
+        """Add the load and the factors of gain and time constant, if they can change."""
         if self._is_disturbed:
             info["disturbance"] = load
         if self._drifts:
@@ -377,4 +418,5 @@ MiddlePointEnv.__doc__ = insert_table(MiddlePointEnv.__doc__)
 
 
 def _limited(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value))  # in this order, NaN becomes a limit
+    """Return a value within +-limit; by this order of min and max, NaN becomes the limit."""
+    return max(-limit, min(limit, value))

@@ -16,8 +16,8 @@ import numpy as np
 from mptc_gym import checks
 from mptc_gym.checks import Number, reject
 
-Value = TypeVar("Value")  # of a plant number: float, an array for many plants, or `Number`
-_LOAD: Final = ("disturbance_amplitude", "disturbance_walk_variance")
+Value = TypeVar("Value")  # of a plant number: a float, an array for many plants, or a `Number`
+_LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
 
 class Argument(NamedTuple):
@@ -40,9 +40,11 @@ def _arg(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
 class PlantNumbers(Generic[Value]):
     """The numbers of a plant that can differ from episode to episode.
 
-    As an argument, each is a `Number`: a number, or a range to draw from. During an episode,
-    each is a float for one plant, and an array for many. Field i takes draw i of a reset. The
-    order never changes, so that seeds keep their meaning, and new fields come last.
+    As arguments they are of type `Number`: a number, or a range from which each reset draws.
+    During an episode they are floats for one plant, and arrays for many plants.
+
+    Field i takes the i-th random number of a reset. So the order of the fields never changes,
+    and new fields come last: otherwise a seed would stand for another plant.
     """
 
     delay: Value = _arg(18, checks.samples, "samples", "transport delay d of (28)")
@@ -57,20 +59,30 @@ class PlantNumbers(Generic[Value]):
         0.0, checks.not_negative, "degC", "largest level of the load's steps"
     )
     disturbance_interval: Value = _arg(
-        150.0, checks.at_least_1, "samples", "mean interval of its steps; below 10 it is 10"
+        150.0,
+        checks.at_least_1,
+        "samples",
+        "mean time between load steps; values below 10 are treated as 10",
     )
     disturbance_walk_variance: Value = _arg(
-        0.0, checks.not_negative, "degC^2", "variance that the load's walk gains a sample"
+        0.0, checks.not_negative, "degC^2", "variance that the load's walk gains per sample"
     )
     gain_factor: Value = _arg(1.0, checks.positive, "1", "multiple of the steady-state gain")
-    time_constant_factor: Value = _arg(1.0, checks.positive, "1", "that of the time constant")
-    gain_drift: Value = _arg(
-        1.0, checks.positive, "1", "factor by which the gain changes in `drift_samples`"
+    time_constant_factor: Value = _arg(
+        1.0, checks.positive, "1", "multiple of the dominant time constant"
     )
-    time_constant_drift: Value = _arg(1.0, checks.positive, "1", "that of the time constant")
+    gain_drift: Value = _arg(
+        1.0, checks.positive, "1", "gain after `drift_samples` divided by the initial one"
+    )
+    time_constant_drift: Value = _arg(
+        1.0,
+        checks.positive,
+        "1",
+        "time constant after `drift_samples` divided by the initial one",
+    )
 
     def chosen(self, names: Iterable[str]) -> dict[str, Value]:
-        """Return some of the numbers by name."""
+        """Return the numbers of these names."""
         return {name: getattr(self, name) for name in names}
 
 
@@ -90,7 +102,11 @@ class Parameters(PlantNumbers[Number]):
 
     <arguments>
 
-    The ValueError for an argument out of range names it, its value and what is allowed.
+    Raises
+    ------
+    ValueError
+        If an argument is out of range. The message names the argument, its value and what is
+        allowed.
     """
 
     # The plant, (28): A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k). With an unstable A, y
@@ -104,9 +120,11 @@ class Parameters(PlantNumbers[Number]):
     c: Sequence[float] = _arg(
         (1.0, -0.35740, -0.03392), checks.polynomial, "1", "C in (28), from z^0; begins with 1"
     )
-    drift_samples: int = _arg(1200, checks.duration, "samples", "duration of the drifts")
+    drift_samples: int = _arg(
+        1200, checks.duration, "samples", "duration of the drifts of gain and time constant"
+    )
     sampling_interval: float = _arg(8.0, checks.positive, "s", "scale of the time axis only")
-    # The paper plots the set point without stating it.
+    # The paper plots the set point without stating its values.
     setpoint: str | float | Sequence[float] = _arg(
         "square",
         checks.setpoint,
@@ -115,26 +133,51 @@ class Parameters(PlantNumbers[Number]):
         "the last one held: [-5, 5] is two samples, not a range",
     )
     setpoint_amplitude: float = _arg(
-        5.0, checks.not_negative, "degC", '"square": A, then -A. "random": uniform in [-A, A]'
+        5.0,
+        checks.not_negative,
+        "degC",
+        'A: "square" alternates between A and -A; "random" draws levels uniformly from [-A, A]',
     )
     setpoint_period: int = _arg(
         600,
         checks.duration,
         "samples",
-        'of "square". "random": levels last for a length uniform in [period/6, period/2]',
+        'P: "square" repeats every P samples; "random" holds a level for P/6 to P/2 samples, '
+        "uniformly",
     )
     # The observation. By default it is the six inputs of the paper's network: y_d(k), y_d(k-1),
     # y_d(k-2), e(k), e(k-1), e(k-2).
-    setpoint_window: int = _arg(3, checks.samples, "samples", "latest set points observed")
-    error_window: int = _arg(3, checks.samples, "samples", "the same of errors")
-    output_window: int = _arg(0, checks.samples, "samples", "the same of measured outputs")
-    action_window: int = _arg(0, checks.samples, "samples", "the same of past actions")
-    temperature_span: float = _arg(50.0, checks.positive, "degC", "readings saturate at +-this")
-    reward: str = _arg("quadratic", checks.reward, "", '"quadratic" or "absolute"')
-    error_scale: float = _arg(
-        5.0, checks.positive, "degC", 'error that costs 1/2 ("quadratic") or 1 ("absolute")'
+    setpoint_window: int = _arg(
+        3, checks.samples, "samples", "number of latest set points observed"
     )
-    move_weight: float = _arg(0.0, checks.not_negative, "1", "cost of moving the action by 1")
+    error_window: int = _arg(3, checks.samples, "samples", "number of latest errors observed")
+    output_window: int = _arg(
+        0, checks.samples, "samples", "number of latest measured outputs observed"
+    )
+    action_window: int = _arg(
+        0, checks.samples, "samples", "number of latest past actions observed"
+    )
+    temperature_span: float = _arg(
+        50.0,
+        checks.positive,
+        "degC",
+        "the transmitter's readings saturate at +- this value",
+    )
+    reward: str = _arg(
+        "quadratic", checks.reward, "", 'form of the reward: "quadratic" or "absolute"'
+    )
+    error_scale: float = _arg(
+        5.0,
+        checks.positive,
+        "degC",
+        'error whose reward is -1/2 (if "quadratic") or -1 (if "absolute")',
+    )
+    move_weight: float = _arg(
+        0.0,
+        checks.not_negative,
+        "1",
+        "cost of changing the action by 1",
+    )
 
     def __post_init__(self) -> None:
         for name, argument in ARGUMENTS.items():
@@ -145,56 +188,74 @@ class Parameters(PlantNumbers[Number]):
         self._check_actuator()
         if self.changes_time_constant:
             self._check_time_constant()
-        if self.is_disturbed and not abs(slowest_pole(self.a)) < 1.0:
+        is_stable = abs(slowest_pole(self.a)) < 1.0
+        if self.is_disturbed and not is_stable:
+            load_values = tuple(self.chosen(_LOAD_ARGUMENTS).values())
             allowed = "0 for this a, which is not stable and has no steady state"
-            reject(", ".join(_LOAD), tuple(self.chosen(_LOAD).values()), allowed)
+            reject(", ".join(_LOAD_ARGUMENTS), load_values, allowed)
         if not any(self.windows):
             names = "setpoint_window, error_window, output_window, action_window"
             reject(names, self.windows, "such that the observation has at least one element")
 
     @classmethod
     def of_environment(cls, arguments: Mapping[str, Any]) -> Parameters:
-        """Return those of an environment; TypeError, with a suggestion, if one is unknown."""
+        """Return the parameters that an environment's keyword arguments stand for.
+
+        Raises
+        ------
+        TypeError
+            If an argument is unknown. The message suggests a similar name, if there is one.
+        ValueError
+            If an argument is out of range.
+        """
         for name in arguments:
             if name == "render_mode":
                 raise TypeError("render_mode is not an argument of the plant")
             if name not in ARGUMENTS:
-                close = difflib.get_close_matches(name, [*ARGUMENTS, "render_mode"], n=1)
-                hint = f": did you mean {close[0]!r}?" if close else ""
-                # In Python's own words, by which callers detect an unsupported argument.
+                similar = difflib.get_close_matches(name, [*ARGUMENTS, "render_mode"], n=1)
+                hint = f": did you mean {similar[0]!r}?" if similar else ""
+                # These are Python's words, by which callers detect an unsupported argument.
                 raise TypeError(
                     f"MiddlePoint-v0 got an unexpected keyword argument {name!r}{hint}"
                 )
         return cls(**arguments)
 
     def _check_actuator(self) -> None:
-        """Refuse limits and a dead zone unless they fit together for every draw."""
-        (lowest, low), (high, highest) = self.range_of("u_min"), self.range_of("u_max")
-        if low >= high:
+        """Refuse limits and dead zones that do not fit together in every episode."""
+        lowest_u_min, highest_u_min = self.range_of("u_min")
+        lowest_u_max, highest_u_max = self.range_of("u_max")
+        if highest_u_min >= lowest_u_max:
             reject("u_min", self.u_min, f"below u_max = {self.u_max}")
-        # The least of max(|u_min|, |u_max|) over all draws.
-        reach = max(lowest, -low, high, -highest, 0.0)
-        if self.range_of("dead_zone")[1] > reach:
+        # The largest magnitude of a command, max(|u_min|, |u_max|), where the draws make it
+        # smallest. Over a range [low, high], the smallest magnitude is max(low, -high, 0).
+        reach = max(lowest_u_min, -highest_u_min, lowest_u_max, -highest_u_max, 0.0)
+        _, largest_dead_zone = self.range_of("dead_zone")
+        if largest_dead_zone > reach:
             allowed = "small enough for some command to pass, at most max(|u_min|, |u_max|)"
             reject("dead_zone", self.dead_zone, f"{allowed} = {reach:g}")
 
     def _check_time_constant(self) -> None:
-        """Refuse changes of the time constant that are undefined for A."""
-        names = "time_constant_factor", "time_constant_drift"
-        pole, (factor, drift) = slowest_pole(self.a), (self.range_of(name)[0] for name in names)
-        rate = 1.0 - pole.real
+        """Refuse a changed time constant if A has none, or if its pole would fall below 0."""
+        pole = slowest_pole(self.a)
+        rate = 1.0 - pole.real  # 1 / time constant, per sample
+        lowest_factor, _ = self.range_of("time_constant_factor")
+        lowest_drift, _ = self.range_of("time_constant_drift")
         if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
             allowed = f"1 for this a, whose slowest pole is {pole:g}, not one between 0 and 1"
-        elif factor * min(drift, 1.0) < rate:
+        elif lowest_factor * min(lowest_drift, 1.0) < rate:
             allowed = f"such that the factor is never below {rate:g}, where that pole is 0"
         else:
             return
+        names = "time_constant_factor", "time_constant_drift"
         reject(", ".join(names), tuple(self.chosen(names).values()), allowed)
 
     def range_of(self, name: str) -> tuple[float, float]:
         """Return the lowest and the highest value that a plant number can take."""
         value = getattr(self, name)
-        return value if isinstance(value, tuple) else (value, value)
+        if isinstance(value, tuple):
+            low, high = value
+            return low, high
+        return value, value
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -205,9 +266,10 @@ class Parameters(PlantNumbers[Number]):
     @property
     def is_disturbed(self) -> bool:
         """Whether there is a load disturbance."""
-        return self._can_differ(0.0, *_LOAD)
+        return self._can_differ(0.0, *_LOAD_ARGUMENTS)
 
     def _can_differ(self, value: float, *names: str) -> bool:
+        """Return whether one of these plant numbers is, or can be drawn, other than `value`."""
         return any(self.range_of(name) != (value, value) for name in names)
 
     @property
@@ -217,12 +279,12 @@ class Parameters(PlantNumbers[Number]):
 
     @property
     def changes_time_constant(self) -> bool:
-        """Whether the time constant differs, or may come to differ, from that of A."""
+        """Whether the time constant can differ from that of A, at the start or by drift."""
         return self._can_differ(1.0, "time_constant_factor", "time_constant_drift")
 
     @property
     def changes_dynamics(self) -> bool:
-        """Whether the coefficients of (28) differ, or may come to differ, from A and B."""
+        """Whether A and B of (28) can change, at the start or by drift."""
         return self.drifts or self._can_differ(1.0, "gain_factor", "time_constant_factor")
 
     @property
@@ -231,34 +293,45 @@ class Parameters(PlantNumbers[Number]):
         return self.setpoint_window, self.error_window, self.output_window, self.action_window
 
 
-ARGUMENTS: Final = {each.name: each.metadata["argument"] for each in fields(Parameters)}
-"""The declaration of each argument, by name."""
+ARGUMENTS: Final[dict[str, Argument]] = {
+    parameter.name: parameter.metadata["argument"] for parameter in fields(Parameters)
+}
+"""The declaration of every argument, by name."""
 
-PLANT_NUMBERS: Final = {each.name: i for i, each in enumerate(fields(PlantNumbers))}
-"""The arguments that can be ranges, by name, and the index of the draw that each takes."""
+PLANT_NUMBERS: Final = {number.name: i for i, number in enumerate(fields(PlantNumbers))}
+"""The index of the random number that a plant number takes at a reset, by name."""
 
 
 def argument_table() -> str:
     """Return a Markdown table of all arguments except `render_mode`."""
     rows = ["| Argument | Default | Unit | Meaning |", "|---|---|---|---|"]
-    for name, each in ARGUMENTS.items():
-        default = repr(each.default).replace("'", '"') + "*" * (name in PLANT_NUMBERS)
-        rows.append(f"| `{name}` | {default} | {each.unit} | {each.meaning} |")
+    for name, argument in ARGUMENTS.items():
+        default = repr(argument.default).replace("'", '"')
+        if name in PLANT_NUMBERS:
+            default += "*"
+        rows.append(f"| `{name}` | {default} | {argument.unit} | {argument.meaning} |")
     return "\n".join(rows)
 
 
 def insert_table(docstring: str | None) -> str | None:
-    """Insert the table of arguments in a docstring, which is None under `python -OO`."""
-    return docstring and inspect.cleandoc(docstring).replace("<arguments>", argument_table())
+    """Return a docstring with the table of arguments in place of `<arguments>`."""
+    if docstring is None:  # under `python -OO`
+        return None
+    return inspect.cleandoc(docstring).replace("<arguments>", argument_table())
 
 
 Parameters.__doc__ = insert_table(Parameters.__doc__)
 
 
 def spelt_out(function: Callable[..., Any]) -> inspect.Signature:
-    """Return a method's signature for help(), with each argument in place of **arguments."""
-    spelt = [*inspect.signature(function).parameters.values()][1:-1]
-    for each in inspect.signature(Parameters).parameters.values():
-        number = "float | Sequence[float]" if each.name in PLANT_NUMBERS else each.annotation
-        spelt.append(each.replace(annotation=number))
-    return inspect.Signature(spelt)
+    """Return the signature of a constructor, for help() and editors.
+
+    All arguments of the environment take the place of `**arguments`.
+    """
+    _, *parameters, _ = inspect.signature(function).parameters.values()  # not self, **arguments
+    for parameter in inspect.signature(Parameters).parameters.values():
+        annotation = parameter.annotation
+        if parameter.name in PLANT_NUMBERS:
+            annotation = "float | Sequence[float]"
+        parameters.append(parameter.replace(annotation=annotation))
+    return inspect.Signature(parameters)

@@ -28,6 +28,7 @@ def least_effective(dead_zone: Any, u_min: Any, u_max: Any, rounding: float = 2.
 
     A command on the edge of the dead zone passes. Scaled to an action and back, it may shrink
     by a few roundings, each of at most 2^-53 of the rounded number; it must still pass.
+    `rounding` bounds their sum, as a share of the largest numbers involved.
     """
     return dead_zone - rounding * (u_max - u_min + abs(u_max) + abs(u_min))
 
@@ -37,58 +38,77 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 
     Rounding to float32 can move a command from the edge of the dead zone into it: float32(0.7)
     stands for 6.99999988 t/h. Such an action is moved outwards by the float32 spacing near 1.
+    The arguments broadcast, and the actions have their shape.
     """
-    command, half_range = np.asarray(command, float), (u_max - u_min) / 2.0
-    action = np.asarray(action_from_command(command, u_min, u_max)).astype(np.float32)
-    rounded = (action.astype(float) + 1.0) * half_range + u_min  # as the plant does
-    swallowed = (np.abs(command) >= dead_zone) & ~(np.abs(rounded) >= dead_zone)
-    step = np.spacing(np.maximum(np.abs(action), np.float32(1.0)))
-    return np.where(swallowed, action + np.copysign(step, command).astype(np.float32), action)
+    commands = np.asarray(command, float)
+    actions = np.asarray(action_from_command(commands, u_min, u_max)).astype(np.float32)
+    half_range = (u_max - u_min) / 2.0
+    rounded = (actions.astype(float) + 1.0) * half_range + u_min  # as the plant does
+    lost_its_effect = (np.abs(commands) >= dead_zone) & ~(np.abs(rounded) >= dead_zone)
+    spacing = np.spacing(np.maximum(np.abs(actions), np.float32(1.0)))
+    outwards = actions + np.copysign(spacing, commands).astype(np.float32)
+    return np.where(lost_its_effect, outwards, actions)
 
 
 class Dynamics:
     """A and B of (28) as functions of the steady-state gain and the dominant time constant.
 
-    The environment's docstring says how. The time constant 1 / (1 - p) is the area above the
-    step response of 1 / (1 - p z^-1), scaled to end at 1. As A(1) = (1 - p) Q(1) is divided by
-    t, too, B is multiplied by g / t for g times the steady-state gain B(1) / A(1).
+    Gain and time constant are given as factors: g times the gain B(1) / A(1) of the paper's
+    coefficients, and t times their time constant 1 / (1 - p), where p is the slowest pole and
+    A = (1 - p z^-1) Q. The time constant is the area above the step response of
+    1 / (1 - p z^-1), scaled to end at 1. For t times as much, 1 - p is divided by t, and Q
+    stays. As this divides A(1) = (1 - p) Q(1) by t, too, B is multiplied by g / t.
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        self._samples = parameters.drift_samples
+        self._drift_samples = parameters.drift_samples
         self._alpha = tuple(-coefficient for coefficient in parameters.a[1:])
-        self._sum = sum(parameters.a)
-        self._quotient: tuple[float, ...] | None = None
+        self._sum_of_a = sum(parameters.a)  # A(1)
+        self._quotient: tuple[float, ...] | None = None  # Q, if the time constant changes
         if parameters.changes_time_constant:
-            pole = slowest_pole(parameters.a).real  # as Parameters has checked
+            pole = slowest_pole(parameters.a).real  # a real one, as Parameters has checked
             self._rate = 1.0 - pole
-            terms = accumulate(parameters.a[:-1], lambda before, here: here + pole * before)
-            self._quotient = (*terms, 0.0)  # Q, by Horner's scheme
+            # A / (1 - p z^-1) by Horner's scheme.
+            quotient = accumulate(
+                parameters.a[:-1], lambda previous, coefficient: coefficient + pole * previous
+            )
+            self._quotient = (*quotient, 0.0)
 
     def share(self, age: Any) -> Any:
         """Return the completed share of the drifts at k = `age`, from 0 to 1."""
-        share = age / self._samples
+        share = age / self._drift_samples
         return share * (share < 1.0) + (share >= 1.0)  # at most 1, for arrays of any library
 
     def factors(self, numbers: PlantNumbers[Any], age: Any) -> tuple[Any, Any]:
         """Return g and t at k = `age`: floats, or arrays or tensors for many plants."""
         share = self.share(age)
-        gain, time_constant = numbers.gain_factor, numbers.time_constant_factor
+        gain = numbers.gain_factor
+        time_constant = numbers.time_constant_factor
         return (
             gain + gain * (numbers.gain_drift - 1.0) * share,
             time_constant + time_constant * (numbers.time_constant_drift - 1.0) * share,
         )
 
     def coefficients(self, gain: Any, time_constant: Any) -> tuple[list[Any], Any, Any]:
-        """Return the coefficients of (28) for g and t.
+        """Return the coefficients of (28) for g = `gain` and t = `time_constant`.
 
-        These are the negated coefficients of A from z^-1 on, the factor of B, and A(1).
+        Returns
+        -------
+        alpha : list
+            Factors of y(k-1), y(k-2), ...: the coefficients of A from z^-1 on, negated.
+        scale : float or array
+            Factor g / t of B.
+        load_gain : float or array
+            Factor A(1) of the load w(k).
         """
         alpha: list[Any] = list(self._alpha)
         if self._quotient is not None:
             pole = 1.0 - self._rate / time_constant
-            alpha = [pole * before - here for before, here in pairwise(self._quotient)]
-        return alpha, gain / time_constant, self._sum / time_constant
+            # -(1 - p z^-1) Q, from z^-1 on.
+            alpha = [
+                pole * previous - following for previous, following in pairwise(self._quotient)
+            ]
+        return alpha, gain / time_constant, self._sum_of_a / time_constant
 
 
 class Plant:
@@ -98,7 +118,10 @@ class Plant:
     meaning is: a command inside the dead zone has no effect, and any other, also one on its
     edge, is limited to [U_min, U_max].
 
-    `factors` are gain and time constant, as multiples of those of A and B.
+    Attributes
+    ----------
+    factors : tuple of float
+        The present gain and time constant, as multiples of those of A and B.
     """
 
     def __init__(self, parameters: Parameters, numbers: PlantNumbers[float]) -> None:
@@ -129,23 +152,26 @@ class Plant:
         edge, u_min, u_max, half_range = self._actuator
         # Section 4, last formula, for actions from -1 to 1 in place of outputs from 0 to 1.
         command = u_min + (action + 1.0) * half_range
-        applied = command  # (29) from here on
+        # (29)
+        applied = command
         if -edge < command < edge:
             applied = 0.0
         elif command < u_min:
             applied = u_min
         elif command > u_max:
             applied = u_max
-        inputs, outputs = self._inputs, self._outputs
+        # (28): the response to the inputs by B, the load, and the past outputs by A.
+        inputs = self._inputs
         inputs.appendleft(applied)
-        response = 0.0  # to the input: B of (28)
+        response = 0.0
         for lag, beta in self._beta:
             response += beta * inputs[lag]
         if load:
             noise += self._load_gain * load
         output = noise + self._scale * response
+        outputs = self._outputs
         for lag, alpha in self._alpha:
-            output += alpha * outputs[lag]  # A of (28)
+            output += alpha * outputs[lag]
         outputs.appendleft(output)
         return command, applied, output
 
@@ -160,65 +186,53 @@ class Plant:
 class PlantBatch:
     """Many plants side by side: `Plant` in arrays.
 
-    `factors` are those of `Plant`, of shape (n,) if they drift or are drawn, otherwise ().
+    Attributes
+    ----------
+    factors : tuple of ndarray of float64
+        Those of `Plant`, of shape (n,) if they drift or are drawn, otherwise ().
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         # In array arithmetic, an array of one number is faster than a number. In comparisons,
         # an array of full length is faster still.
-        self._num_envs, self._drawn = num_envs, parameters.ranges
-        shapes = {name: num_envs if name in self._drawn else () for name in PLANT_NUMBERS}
-        self._numbers: PlantNumbers[Values] = PlantNumbers(
-            **{n: np.full(s, parameters.range_of(n)[0], float) for n, s in shapes.items()}
-        )
+        self._num_envs = num_envs
+        self._drawn_names = parameters.ranges  # names of the plant numbers that are drawn
+        numbers: dict[str, Values] = {}
+        for name in PLANT_NUMBERS:
+            lowest, _ = parameters.range_of(name)
+            shape = (num_envs,) if name in self._drawn_names else ()
+            numbers[name] = np.full(shape, lowest, float)
+        self._numbers: PlantNumbers[Values] = PlantNumbers(**numbers)
         self._update_actuator()
 
         self._dynamics = Dynamics(parameters)
         self._drifts = parameters.drifts
         self._changes_dynamics = parameters.changes_dynamics
-        self._clock = self._next_update = 0
+        # Samples since the plants were created, and at the start of each plant's episode.
+        self._clock = 0
         self._starts = np.zeros(num_envs if self._drifts else (), np.int64)
+        self._next_update = 0  # the clock when the dynamics change next
         self._update_dynamics()
         order = len(self._alpha)
-        self._outputs = deque(np.zeros((order, num_envs)), maxlen=order)
-
-        # Because of the delay, the response to the inputs of d + 1 samples can be computed at
-        # once, where d is the shortest delay that can be drawn. Inputs lie in a window of these
-        # rows, oldest first; before those of the d + 1 samples come the older ones that B and
-        # plants with a longer delay also need.
-        shortest, self._longest = map(int, parameters.range_of("delay"))
-        self._samples = shortest + 1
-        self._beta = tuple(parameters.b)
-        self._own_delays = self._longest > shortest
-        self._older = len(self._beta) - 1 + self._longest - shortest
-        # If plants have their own delays, the window moves with the samples, and the older rows
-        # are copied back only when it reaches the end of the rows.
-        spare = max(self._older, self._samples) if self._own_delays else 0
-        self._inputs = np.zeros((self._older + self._samples + spare, num_envs))
-        self._first_row = 0  # of the window
-        rows = len(self._beta) - 1 + self._samples  # of inputs, at each plant's delay
-        self._taken = np.zeros((rows, num_envs) if self._own_delays else 0, np.intp)
-        self._delayed = np.zeros(self._taken.shape)
-        self._response = np.zeros((self._samples, num_envs))
-        self._place = self._samples - 1  # of the next input among the d + 1
+        self._outputs = deque(np.zeros((order, num_envs)), maxlen=order)  # newest first
+        self._input_response = _InputResponse(parameters, num_envs)
 
     def reset(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
-        """Bring some plants to rest, with new numbers: one per plant if drawn."""
-        self._inputs[:, which] = 0.0
-        self._response[:, which] = 0.0
+        """Bring some plants to rest.
+
+        `which` are their indices. `numbers` are their new plant numbers: those that are drawn
+        have the shape (len(which),), and the others the shape ().
+        """
         for outputs in self._outputs:
             outputs[which] = 0.0
-        for name, values in numbers.chosen(self._drawn).items():
+        self._input_response.reset(which, numbers.delay)
+        for name, values in numbers.chosen(self._drawn_names).items():
             getattr(self._numbers, name)[which] = values
-        if self._drawn:
+        if self._drawn_names:
             self._update_actuator()
-        if self._own_delays:
-            first = self._longest - numbers.delay.astype(np.intp)
-            rows = np.arange(len(self._taken))[:, np.newaxis] + first
-            self._taken[:, which] = rows * self._num_envs + which
         if self._drifts:
             self._starts[which] = self._clock
-        if self._drawn or self._drifts:
+        if self._drawn_names or self._drifts:
             self._update_dynamics()
 
     def step(
@@ -226,7 +240,7 @@ class PlantBatch:
     ) -> tuple[Values, Values, Values]:
         """Move all plants from sample k to k+1, like `Plant.step`, in arrays of shape (n,).
 
-        The plants keep the output, so it must not be modified.
+        The plants keep the output, so the caller must not modify it.
         """
         if self._drifts:
             self._clock += 1
@@ -236,59 +250,117 @@ class PlantBatch:
         command = action + one
         command *= half_range
         command += offset
-        applied = np.minimum(command, u_max)  # (29) from here on
+        # (29)
+        applied = np.minimum(command, u_max)
         np.maximum(applied, u_min, out=applied)
         # A product is faster than a mask, whose branches are unpredictable. It can give -0,
         # which adding 0 turns into 0.
         applied *= np.abs(command) >= edge
         applied += zero
-        place = self._place
-        self._inputs[self._first_row + self._older + place] = applied
-        place += 1
-        if place == self._samples:
-            self._respond()
-            place = 0
-        self._place = place
-        response = self._response[place]
+        # (28): the response to the inputs by B, the load, and the past outputs by A.
+        response = self._input_response.add(applied)
         if self._changes_dynamics:
             response = self._scale * response
         if load is not None:
             noise = noise + self._load_gain * load
         output: Values = noise + response
-        for term in map(mul, self._alpha, self._outputs):  # A of (28)
+        for term in map(mul, self._alpha, self._outputs):
             output += term
         self._outputs.appendleft(output)
         return command, applied, output
 
-    def _respond(self) -> None:
-        """Compute the response to the inputs of d + 1 samples."""
-        first, older, samples = self._first_row, self._older, self._samples
-        inputs = self._inputs[first : first + older + samples]
-        if self._own_delays:
-            inputs = inputs.take(self._taken, out=self._delayed, mode="clip")
-        self._response[:] = 0.0
-        for lag, beta in enumerate(self._beta):  # B of (28)
-            newest = len(self._beta) - 1 - lag
-            self._response += beta * inputs[newest : newest + samples]
-        first += samples
-        if first + older + samples > len(self._inputs):
-            self._inputs[:older] = self._inputs[first : first + older]
-            first = 0
-        self._first_row = first
-
     def _update_actuator(self) -> None:
-        """Update what the scaling of commands and (29) take from the plant numbers."""
-        u_min, u_max = self._numbers.u_min, self._numbers.u_max
-        edge = least_effective(self._numbers.dead_zone, u_min, u_max)
-        numbers = map(np.array, (0.0, 1.0, (u_max - u_min) / 2.0, u_min, edge))
-        limits = (np.full(self._num_envs, limit) for limit in (u_min, u_max))
-        self._actuator = *numbers, *limits
+        """Compute what a step needs of the actuator's numbers."""
+        u_min = self._numbers.u_min
+        u_max = self._numbers.u_max
+        self._actuator = (
+            np.array(0.0),
+            np.array(1.0),
+            np.array((u_max - u_min) / 2.0),
+            np.array(u_min),
+            np.array(least_effective(self._numbers.dead_zone, u_min, u_max)),
+            np.full(self._num_envs, u_min),
+            np.full(self._num_envs, u_max),
+        )
 
     def _update_dynamics(self) -> None:
-        """Update the dynamics to the plants' ages."""
+        """Update the dynamics to the ages of the plants, in steps of `DRIFT_INTERVAL`."""
         ages = self._clock - self._starts
-        slow = ages // DRIFT_INTERVAL * DRIFT_INTERVAL
-        self.factors = self._dynamics.factors(self._numbers, slow)
+        last_changes = ages // DRIFT_INTERVAL * DRIFT_INTERVAL
+        self.factors = self._dynamics.factors(self._numbers, last_changes)
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*self.factors)
         self._alpha = tuple(map(np.asarray, alpha))
-        self._next_update = self._clock + int((slow + DRIFT_INTERVAL - ages).min())
+        samples_to_change = last_changes + DRIFT_INTERVAL - ages
+        self._next_update = self._clock + int(samples_to_change.min())
+
+
+class _InputResponse:
+    """The response of many plants to their inputs: B of (28), for a block of samples at once.
+
+    With d the shortest delay that can be drawn, the inputs of d + 1 samples affect no output
+    before the last of them is known. So the response to such a block is computed when it is
+    complete, and then read sample by sample.
+
+    The inputs lie in rows, one per sample, the oldest first. A window of the rows holds the
+    block and, before it, the older inputs that B and longer delays also need. After each block
+    the window moves on by the length of a block. At the end of the rows it moves back to the
+    first, and the older inputs are copied there.
+    """
+
+    def __init__(self, parameters: Parameters, num_envs: int) -> None:
+        self._num_envs = num_envs
+        self._beta = tuple(parameters.b)
+        shortest, self._longest = map(int, parameters.range_of("delay"))
+        self._block = shortest + 1  # samples
+        self._older = len(self._beta) - 1 + self._longest - shortest
+        # If the delays differ, many inputs are older. Spare rows make copies of them rare.
+        self._delays_differ = self._longest > shortest
+        spare = max(self._older, self._block) if self._delays_differ else 0
+        self._inputs = np.zeros((self._older + self._block + spare, num_envs))
+        self._first_row = 0  # of the window
+        self._response = np.zeros((self._block, num_envs))
+        self._place = self._block - 1  # of the next input in the block: the first completes it
+        # If the delays differ: the inputs of the window at the delay of each plant, and their
+        # indices in the flattened window.
+        rows = len(self._beta) - 1 + self._block if self._delays_differ else 0
+        self._delayed = np.zeros((rows, num_envs))
+        self._delayed_at = np.zeros((rows, num_envs), np.intp)
+
+    def reset(self, which: NDArray[np.intp], delays: Values) -> None:
+        """Begin an episode of some plants, whose inputs have been 0 so far.
+
+        `delays` have the shape (len(which),) if they are drawn, otherwise ().
+        """
+        self._inputs[:, which] = 0.0
+        self._response[:, which] = 0.0
+        if self._delays_differ:
+            first_rows = self._longest - delays.astype(np.intp)
+            rows = np.arange(len(self._delayed))[:, np.newaxis] + first_rows
+            self._delayed_at[:, which] = rows * self._num_envs + which
+
+    def add(self, applied: Values) -> Values:
+        """Add u_a(k), t/h, and return the response in y(k+1), degC; only to be read."""
+        place = self._place
+        self._inputs[self._first_row + self._older + place] = applied
+        place += 1
+        if place == self._block:
+            self._respond()
+            place = 0
+        self._place = place
+        response: Values = self._response[place]
+        return response
+
+    def _respond(self) -> None:
+        """Compute the response to a complete block of inputs, and move the window on."""
+        end = self._first_row + self._older + self._block
+        inputs = self._inputs[self._first_row : end]
+        if self._delays_differ:
+            inputs = inputs.take(self._delayed_at, out=self._delayed, mode="clip")
+        self._response[:] = 0.0
+        for lag, beta in enumerate(self._beta):
+            first = len(self._beta) - 1 - lag
+            self._response += beta * inputs[first : first + self._block]
+        self._first_row += self._block
+        if end + self._block > len(self._inputs):
+            self._inputs[: self._older] = self._inputs[self._first_row : end]
+            self._first_row = 0

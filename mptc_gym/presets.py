@@ -2,6 +2,7 @@
 
 from typing import Any, Final
 
+# A boiler in operation: noise, and a load that steps and drifts.
 _BOILER: Final[dict[str, Any]] = {
     "noise_variance": 0.5,
     "measurement_noise_variance": 0.1,
@@ -10,6 +11,7 @@ _BOILER: Final[dict[str, Any]] = {
     "disturbance_walk_variance": 0.0005,
 }
 
+# Plants that differ from episode to episode.
 _SPREAD: Final[dict[str, Any]] = {
     "delay": [12, 24],
     "dead_zone": [3.0, 7.0],
@@ -33,8 +35,13 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
         "setpoint": "random",
     },
 }
-"""The environment's arguments in each preset: "paper" is the paper's first case, "dead-zone-7"
-its second, "noisy" its third; the others are described in the package's README."""
+"""The arguments of the environment in each preset, by its name.
+
+"paper", "dead-zone-7" and "noisy" are the three cases of the paper. "disturbed" adds
+measurement noise and a load disturbance; "fouling" adds drifts of gain and time constant to
+these. "randomised" draws the plant and its noise at each reset. "hard" combines all of this
+with random set points.
+"""
 
 IDS: Final[dict[str, str]] = {
     name: f"MiddlePoint{name.title().replace('-', '')}-v0" for name in PRESETS

@@ -1,7 +1,8 @@
-"""Draw what an episode meets: plant numbers, set point, noise and load disturbance.
+"""Generate the external signals of an episode: set point, noise and load disturbance.
 
 Every signal has the same methods. `reset` begins an episode of some plants at k = 0. `next`
-returns the next sample of all plants, and `ahead` the next `BLOCK` samples of a single plant.
+returns the next sample of all plants. `ahead` returns the next `BLOCK` samples of the only
+plant, and is used in place of `next`.
 
 Noise and disturbance are generated a block of samples at a time: drawing many numbers in one
 call is much faster than drawing them one by one, and gives the same numbers.
@@ -12,144 +13,62 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import PLANT_NUMBERS, Parameters, PlantNumbers
+from mptc_gym.draws import EpisodeStream, Streams
+from mptc_gym.parameters import Parameters, PlantNumbers
 
-Values = NDArray[np.float64]  # one per plant; of plant numbers, () where all share one value
+Values = NDArray[
+    np.float64
+]  # one per plant; plant numbers that all plants share are of shape ()
 Indices = NDArray[np.intp]  # of some plants, sorted
-Sources = Mapping[int, "Streams"] | Sequence["Streams"]  # those of each plant
+StreamsOfPlants = Mapping[int, Streams] | Sequence[Streams]  # by the index of the plant
 
-DRAWS = 32  # of plant numbers per episode: enough for all, and for future ones
 BLOCK = 600  # samples of a signal generated together
 FOREVER = 1 << 62  # samples
 PLANTS_AT_A_TIME = 32  # few enough that their draws stay in the processor's cache
 LOAD_INTERVAL = 10  # samples between changes of the load disturbance
 LEVELS_AT_A_TIME = 60  # of the load disturbance, generated together
 ONE = np.zeros(1, np.intp)  # the indices of one plant
-_PCG64 = {"bit_generator": "PCG64", "has_uint32": 0, "uinteger": 0}  # and its state
-
-
-class EpisodeStream:
-    """A stream of random numbers in which every episode has its own starting point.
-
-    Episode j begins j * 2**64 draws into the stream, however many earlier episodes have used.
-    So the j-th episode after a seed gets the same draws, however long those before it were.
-    The `SeedSequence` with these arguments, which starts the stream, is created at the first
-    episode, as many plants have streams that are never used.
-    """
-
-    # Without a dict each, the streams of 100,000 plants take little memory.
-    __slots__ = ("_episode", "_origin", "_seeds", "generator")
-
-    generator: np.random.Generator  # of the current episode
-
-    def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
-        self._seeds = entropy, spawn_key, pool_size
-        self._episode = 0
-
-    def next_episode(self) -> np.random.Generator:
-        """Move to the start of the next episode and return the generator there."""
-        if self._episode == 0:
-            entropy, spawn_key, pool_size = self._seeds
-            seeds = np.random.SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size)
-            self.generator = np.random.Generator(np.random.PCG64(seeds))
-            self._origin = self.generator.bit_generator.state["state"]
-        else:
-            # Taken from the generator, as a copy of it may have its own bit generator.
-            bits: Any = self.generator.bit_generator
-            bits.state = {**_PCG64, "state": self._origin}
-            bits.advance(self._episode << 64)
-        self._episode += 1
-        return self.generator
-
-
-class Streams(NamedTuple):
-    """All streams of one plant; new ones come last, so that the others do not change."""
-
-    noise: EpisodeStream
-    setpoint: EpisodeStream
-    plant: EpisodeStream  # first the plant numbers, then the disturbance
-    measurement_noise: EpisodeStream
-
-    @classmethod
-    def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
-        """Make the streams of a seed sequence, each from a child that nobody else gets."""
-        children = seeds.spawn(len(cls._fields))
-        return cls(*(EpisodeStream(c.entropy, c.spawn_key, c.pool_size) for c in children))
-
-    @classmethod
-    def of_seed(cls, seed: int) -> Streams:
-        """Make the streams that `spawn` makes from `SeedSequence(seed)`, but faster."""
-        return cls(*(EpisodeStream(seed, (place,)) for place in range(len(cls._fields))))
-
-
-class Ranges:
-    """Draw arguments that are ranges, uniformly; a delay is an integer, both ends included.
-
-    Every plant number has its own draw, whether it is a range or not, so that one more range
-    does not change the others' draws. `names` are the arguments that are ranges, with their
-    ends. `given` are all plant numbers, with the lower end of a range, in arrays of shape ().
-    """
-
-    def __init__(self, parameters: Parameters) -> None:
-        self.names = parameters.ranges
-        # The disturbance's draws follow those of the plant numbers.
-        self._draws = bool(self.names) or parameters.is_disturbed
-        self.given: PlantNumbers[Values] = PlantNumbers(
-            **{name: np.array(parameters.range_of(name)[0]) for name in PLANT_NUMBERS}
-        )
-
-    def draw(self, streams: Sequence[Streams]) -> PlantNumbers[Values]:
-        """Begin an episode of each plant, and draw its numbers.
-
-        Drawn numbers have the shape (len(streams),), others the shape ().
-        """
-        if not self._draws:
-            return self.given
-        draws = np.empty((len(streams), DRAWS))
-        for own, row in zip(streams, draws, strict=True):
-            own.plant.next_episode().random(out=row)
-        drawn = {}
-        for name, (low, high) in self.names.items():
-            whole = isinstance(low, int)
-            above = draws[:, PLANT_NUMBERS[name]] * (high + whole - low)
-            drawn[name] = low + (np.floor(above).astype(int) if whole else above)
-        return replace(self.given, **drawn)
-
-
-def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
-    """Return the numbers of plant i of many."""
-    own = {name: a[i].item() if a.ndim else a.item() for name, a in vars(numbers).items()}
-    return PlantNumbers(**own)
 
 
 def colours(parameters: Parameters) -> dict[str, Sequence[float]]:
     """Return the coefficients of C in (28) by the name of each noise that is not always 0."""
-    of_all = {"noise": parameters.c, "measurement_noise": (1.0,)}
-    return {n: c for n, c in of_all.items() if parameters.range_of(f"{n}_variance")[1] > 0.0}
+    coefficients = {"noise": parameters.c, "measurement_noise": (1.0,)}
+    return {
+        name: c
+        for name, c in coefficients.items()
+        if parameters.range_of(f"{name}_variance")[1] > 0.0
+    }
 
 
 class Noise:
-    """Noise by name, 0 at k = 0: C(z^-1) xi(k) of (28), or the measurement noise."""
+    """One of the noises, 0 at k = 0: C(z^-1) xi(k) of (28), or the measurement noise.
+
+    `name` is "noise" or "measurement_noise", and `c` are the coefficients of C. The values of
+    `block` samples are generated at a time.
+    """
 
     def __init__(self, name: str, c: Sequence[float], num_envs: int, block: int) -> None:
-        self._name, self._c = name, np.array(c)[:, np.newaxis, np.newaxis]
-        # C times the standard deviation of xi: [lag, plant, 0].
-        self._colour = np.zeros((len(c), num_envs, 1))
+        self._name = name
+        self._c = np.array(c)[:, np.newaxis, np.newaxis]
+        # C times the standard deviation of xi, shape (length of C, num_envs, 1).
+        self._scaled_c = np.zeros((len(c), num_envs, 1))
+        # The latest xi of each plant, the oldest first, as multiples of the deviation.
         self._past = np.zeros((num_envs, len(c) - 1))
-        # One row per sample, so that what all plants need at once is contiguous.
+        # One row per sample, so that the values that all plants need at once are contiguous.
         self._block = np.zeros((block, num_envs))
         self._row = 0  # the next row
 
-    def reset(self, which: Indices, streams: Sources, numbers: PlantNumbers[Values]) -> None:
+    def reset(
+        self, which: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
+    ) -> None:
         """Begin an episode of some plants."""
         deviations = np.sqrt(getattr(numbers, f"{self._name}_variance"))
-        self._colour[:, which] = deviations[..., np.newaxis] * self._c
+        self._scaled_c[:, which] = deviations[..., np.newaxis] * self._c
         self._past[which] = 0.0
         self._streams = streams
         for i in which.tolist():
@@ -180,126 +99,152 @@ class Noise:
         samples = len(self._block) - first_row
         for start in range(0, len(which), PLANTS_AT_A_TIME):
             plants = which[start : start + PLANTS_AT_A_TIME]
-            draws = np.empty((len(plants), order + samples))
-            draws[:, :order] = self._past[plants]
-            for i, row in zip(plants.tolist(), draws[:, order:], strict=True):
+            xi = np.empty((len(plants), order + samples))
+            xi[:, :order] = self._past[plants]
+            for i, row in zip(plants.tolist(), xi[:, order:], strict=True):
                 getattr(self._streams[i], self._name).generator.standard_normal(out=row)
-            self._past[plants] = draws[:, samples:]
-            # If there are no gaps, a slice is much faster.
-            gaps = plants[-1] - plants[0] >= len(plants)
-            columns = plants if gaps else slice(plants[0], plants[-1] + 1)
-            colour = self._colour[:, columns]
-            noise = colour[0] * draws[:, order:]
-            for lag, coefficient in enumerate(colour[1:], start=1):
-                noise += coefficient * draws[:, order - lag : -lag]
+            self._past[plants] = xi[:, samples:]
+            # A slice is much faster than indices, but needs plants without gaps.
+            has_gaps = plants[-1] - plants[0] >= len(plants)
+            columns = plants if has_gaps else slice(plants[0], plants[-1] + 1)
+            c = self._scaled_c[:, columns]
+            noise = c[0] * xi[:, order:]
+            for lag, coefficient in enumerate(c[1:], start=1):
+                noise += coefficient * xi[:, order - lag : -lag]
             self._block[first_row:, columns] = noise.T
 
 
 class Levels:
-    """The levels of a set point, each held for a number of samples."""
+    """The levels of a set point, and for how many samples each of them is held.
+
+    Attributes
+    ----------
+    random : bool
+        Whether levels are drawn: uniformly within +-`amplitude`, degC, and held for a number of
+        samples from `shortest` to `longest`, both included.
+    values, lengths : list
+        Otherwise: the levels, degC, which are repeated, and the samples for which they hold.
+    """
+
+    values: list[float]
+    lengths: list[int]
 
     def __init__(self, parameters: Parameters) -> None:
-        kind, period = parameters.setpoint, parameters.setpoint_period
-        self.random = kind == "random"
-        # Random levels are uniform within +-`amplitude`, degC, and held for `shortest` to
-        # `longest` samples, both included.
-        self.amplitude = amplitude = parameters.setpoint_amplitude
+        setpoint = parameters.setpoint
+        period = parameters.setpoint_period
+        self.random = setpoint == "random"
+        self.amplitude = parameters.setpoint_amplitude
         self.shortest = max(1, math.ceil(period / 6))
         self.longest = max(self.shortest, period // 2)
-        # Others repeat `values`, degC, each held for its number of samples in `lengths`.
-        if isinstance(kind, str):  # "square"
-            self.values = [amplitude, -amplitude]
+        if isinstance(setpoint, str):  # "square"
+            self.values = [self.amplitude, -self.amplitude]
             self.lengths = [(period + 1) // 2, period // 2]
-        else:
-            self.values = [kind] if isinstance(kind, float) else list(kind)
+        elif isinstance(setpoint, float):  # a constant
+            self.values = [setpoint]
+            self.lengths = [FOREVER]
+        else:  # one number per sample, the last one held
+            self.values = list(setpoint)
             self.lengths = [1] * (len(self.values) - 1) + [FOREVER]
 
     def next(self, place: int, stream: EpisodeStream) -> tuple[float, int]:
-        """Return the level at a place, or draw one, degC; and for how many samples it holds."""
-        if not self.random:
-            place %= len(self.values)
-            return self.values[place], self.lengths[place]
-        level = stream.generator.uniform(-self.amplitude, self.amplitude)
-        return level, int(stream.generator.integers(self.shortest, self.longest, endpoint=True))
+        """Return a level, degC, and for how many samples it holds.
+
+        It is drawn from the stream if levels are random. Otherwise it is level number `place`
+        of the episode, counted from 0.
+        """
+        if self.random:
+            level = stream.generator.uniform(-self.amplitude, self.amplitude)
+            length = stream.generator.integers(self.shortest, self.longest, endpoint=True)
+            return level, int(length)
+        place_in_period = place % len(self.values)
+        return self.values[place_in_period], self.lengths[place_in_period]
 
 
-class _Held(ABC):
-    """Values of many plants, each held until it changes."""
+class _HeldValues(ABC):
+    """Values of many plants, each held until the time at which it is due to change.
+
+    Times are counted in samples since the plants were created.
+    """
 
     def __init__(self, num_envs: int) -> None:
-        self._now = np.zeros(num_envs)
-        # Samples since the plants were created, and when, on that clock, each value changes.
-        self._clock = 0
-        self._changes = np.zeros(num_envs, np.int64)
-        self._next_change = 0  # the earliest of them
+        self._clock = 0  # the present time
+        self._current = np.zeros(num_envs)  # the values at this time, degC
+        self._due = np.zeros(num_envs, np.int64)  # the time of each plant's next change
+        self._earliest_due = 0
 
     def next(self) -> Values:
         """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
         self._clock += 1
-        if self._clock >= self._next_change:
-            self._catch_up()
-        return self._now
+        if self._clock >= self._earliest_due:
+            self._make_due_changes()
+        return self._current
 
-    def _catch_up(self) -> None:
-        # Repeated where a level is held for 0 samples, as with a period of 1.
-        while self._clock >= self._next_change:
-            self._change(self._changes <= self._clock)
-            self._next_change = int(self._changes.min())
+    def _make_due_changes(self) -> None:
+        # A value may be held for 0 samples, as with a period of 1: then it changes once more.
+        while self._clock >= self._earliest_due:
+            self._change(self._due <= self._clock)
+            self._earliest_due = int(self._due.min())
 
     @abstractmethod
-    def _change(self, due: NDArray[np.bool_]) -> None:
-        """Change the values that are due, and set when they change next."""
+    def _change(self, is_due: NDArray[np.bool_]) -> None:
+        """Change the values that are due, and set the times of their next changes."""
 
 
-class SetPoint(_Held):
+class SetPoint(_HeldValues):
     """The set point y_d(k)."""
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         super().__init__(num_envs)
         self._levels = Levels(parameters)
-        self._values = np.array(self._levels.values)
-        self._lengths = np.array(self._levels.lengths)
-        self._places = np.zeros(num_envs, np.intp)  # of the next level
+        self._level_values = np.array(self._levels.values)
+        self._level_lengths = np.array(self._levels.lengths)
+        self._places = np.zeros(num_envs, np.intp)  # of each plant's next level
 
-    def reset(self, which: Indices, streams: Sources) -> Values:
-        """Begin an episode of some plants, and return y_d(0)."""
+    def reset(self, which: Indices, streams: StreamsOfPlants) -> Values:
+        """Begin an episode of some plants, and return y_d(0), shape (len(which),)."""
         self._streams = streams
         if self._levels.random:
             for i in which.tolist():
                 streams[i].setpoint.next_episode()
         self._places[which] = 0
-        self._changes[which] = self._next_change = self._clock
-        self._catch_up()
-        return self._now[which]
+        # Their first levels begin now.
+        self._due[which] = self._clock
+        self._earliest_due = self._clock
+        self._make_due_changes()
+        return self._current[which]
 
     def ahead(self) -> list[float]:
         """Return the next block of one plant, degC."""
-        level, place = self._now.item(), self._places.item()
+        level = self._current.item()
+        place = self._places.item()
         values: list[float] = []
-        end = self._next_change - self._clock - 1  # of the level, counted from the next sample
-        while end < BLOCK:
-            values += [level] * (end - len(values))
+        samples_to_change = self._earliest_due - self._clock - 1  # from the start of the block
+        while samples_to_change < BLOCK:
+            values += [level] * (samples_to_change - len(values))
             level, length = self._levels.next(place, self._streams[0].setpoint)
-            place, end = place + 1, end + length
-        self._now[0], self._places[0] = level, place
+            place += 1
+            samples_to_change += length
+        values += [level] * (BLOCK - len(values))
+        self._current[0] = level
+        self._places[0] = place
         self._clock += BLOCK
-        self._next_change = self._clock + 1 + end - BLOCK
-        return values + [level] * (BLOCK - len(values))
+        self._earliest_due = self._clock + 1 + samples_to_change - BLOCK
+        return values
 
-    def _change(self, due: NDArray[np.bool_]) -> None:
-        which = np.flatnonzero(due)
+    def _change(self, is_due: NDArray[np.bool_]) -> None:
+        which = np.flatnonzero(is_due)
         if self._levels.random:
             for i in which.tolist():
-                self._now[i], length = self._levels.next(0, self._streams[i].setpoint)
-                self._changes[i] += length
+                self._current[i], length = self._levels.next(0, self._streams[i].setpoint)
+                self._due[i] += length
         else:
             places = self._places[which]
-            self._now[which] = self._values[places]
-            self._changes[which] += self._lengths[places]
-            self._places[which] = (places + 1) % len(self._values)
+            self._current[which] = self._level_values[places]
+            self._due[which] += self._level_lengths[places]
+            self._places[which] = (places + 1) % len(self._level_values)
 
 
-class Disturbance(_Held):
+class Disturbance(_HeldValues):
     """The load disturbance w(k): the sum of steps and a random walk, both starting at 0.
 
     It changes every `LOAD_INTERVAL` samples. The walk takes a uniform step of the required
@@ -310,41 +255,50 @@ class Disturbance(_Held):
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
-        # Amplitude, probability of a jump, and half width of the walk's steps.
-        self._shapes = np.zeros((num_envs, 3))
-        self._last = np.zeros((num_envs, 2))
-        self._levels = np.zeros((num_envs, LEVELS_AT_A_TIME))  # those ahead
-        # Index of each plant's end in the flattened levels.
+        self._amplitudes = np.zeros(num_envs)  # of the steps, degC
+        self._probabilities = np.zeros(num_envs)  # of a step to a new level at a change
+        self._widths = np.zeros(num_envs)  # half widths of the steps of the walk, degC
+        # Steps and walk at the latest change that has been generated, degC.
+        self._last_steps = np.zeros(num_envs)
+        self._last_walk = np.zeros(num_envs)
+        self._levels = np.zeros((num_envs, LEVELS_AT_A_TIME))  # generated ahead, degC
+        # Indices in the flattened levels: the end of each plant's row, and its next level.
         self._ends = np.arange(1, num_envs + 1) * LEVELS_AT_A_TIME
-        self._places = self._ends.copy()  # of the next level, in the flattened levels
+        self._places = self._ends.copy()
 
-    def reset(self, which: Indices, streams: Sources, numbers: PlantNumbers[Values]) -> None:
+    def reset(
+        self, which: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
+    ) -> None:
         """Begin an episode of some plants, whose numbers have been drawn before."""
         self._streams = streams
-        probability = LOAD_INTERVAL / numbers.disturbance_interval
+        self._amplitudes[which] = numbers.disturbance_amplitude
+        self._probabilities[which] = LOAD_INTERVAL / numbers.disturbance_interval
         # Uniform within +-h, a step of the walk has the variance h^2 / 3.
-        width = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
-        shapes = np.broadcast_arrays(numbers.disturbance_amplitude, probability, width)
-        self._shapes[which] = np.stack(shapes, axis=-1)
-        self._last[which] = self._now[which] = 0.0
+        self._widths[which] = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
+        self._last_steps[which] = 0.0
+        self._last_walk[which] = 0.0
+        self._current[which] = 0.0
         self._places[which] = self._ends[which]
-        self._changes[which] = self._clock + LOAD_INTERVAL
-        self._next_change = int(self._changes.min())
-        self._ahead = [0.0] * (LOAD_INTERVAL - 1)  # of a single plant
+        self._due[which] = self._clock + LOAD_INTERVAL
+        self._earliest_due = int(self._due.min())
+        self._ahead = [0.0] * (LOAD_INTERVAL - 1)  # samples of the only plant; see `ahead`
 
     def ahead(self) -> list[float]:
         """Return the next block of one plant, degC."""
         while len(self._ahead) < BLOCK:
             self._refill(ONE)
             self._ahead += np.repeat(self._levels[0], LOAD_INTERVAL).tolist()
-        values, self._ahead = self._ahead[:BLOCK], self._ahead[BLOCK:]
-        return values
+        block = self._ahead[:BLOCK]
+        self._ahead = self._ahead[BLOCK:]
+        return block
 
-    def _change(self, due: NDArray[np.bool_]) -> None:
-        self._refill(np.flatnonzero(due & (self._places == self._ends)))
-        np.copyto(self._now, self._levels.take(self._places, mode="clip"), where=due)
-        self._places += due
-        self._changes += LOAD_INTERVAL * due
+    def _change(self, is_due: NDArray[np.bool_]) -> None:
+        is_empty = self._places == self._ends
+        self._refill(np.flatnonzero(is_due & is_empty))
+        next_levels = self._levels.take(self._places, mode="clip")
+        np.copyto(self._current, next_levels, where=is_due)
+        self._places += is_due
+        self._due += LOAD_INTERVAL * is_due
 
     def _refill(self, which: Indices) -> None:
         """Generate the next levels of some plants."""
@@ -353,19 +307,31 @@ class Disturbance(_Held):
             draws = np.empty((len(plants), LEVELS_AT_A_TIME, 3))
             for i, row in zip(plants.tolist(), draws, strict=True):
                 self._streams[i].plant.generator.random(out=row)
-            self._levels[plants] = self._sum(plants, draws)
+            self._levels[plants] = self._generate(plants, draws)
         self._places[which] = self._ends[which] - LEVELS_AT_A_TIME
 
-    def _sum(self, plants: Indices, draws: Values) -> Values:
-        """Return levels w, (plants, levels), from uniform draws, (plants, levels, 3)."""
-        amplitude, probability, width = self._shapes[plants, :, np.newaxis].swapaxes(0, 1)
-        step, walk = self._last[plants, :, np.newaxis].swapaxes(0, 1)  # the previous ones
-        walk = np.hstack((walk, (2.0 * draws[..., 0] - 1.0) * width)).cumsum(axis=1)[:, 1:]
-        jumps = draws[..., 1] < probability
-        steps = np.hstack((step, (2.0 * draws[..., 2] - 1.0) * amplitude))
-        latest = np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0)
-        steps = np.take_along_axis(steps, np.maximum.accumulate(latest, axis=1), axis=1)
-        self._last[plants] = np.stack((steps[:, -1], walk[:, -1]), axis=1)
+    def _generate(self, plants: Indices, draws: Values) -> Values:
+        """Return the next levels w of some plants, degC, shape (plants, levels).
+
+        `draws` are uniform from 0 to 1, shape (plants, levels, 3): for the steps of the walk,
+        for whether a new level begins, and for this level.
+        """
+        walk_draws, jump_draws, level_draws = np.moveaxis(draws, -1, 0)
+        walk_steps = (2.0 * walk_draws - 1.0) * self._widths[plants, np.newaxis]
+        last_walk = self._last_walk[plants, np.newaxis]
+        walk = np.hstack((last_walk, walk_steps)).cumsum(axis=1)[:, 1:]
+
+        new_levels = (2.0 * level_draws - 1.0) * self._amplitudes[plants, np.newaxis]
+        candidates = np.hstack((self._last_steps[plants, np.newaxis], new_levels))
+        # The level at a change is the candidate of the latest jump; the first candidate is the
+        # level before.
+        jumps = jump_draws < self._probabilities[plants, np.newaxis]
+        jump_indices = np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0)
+        latest_jumps = np.maximum.accumulate(jump_indices, axis=1)
+        steps = np.take_along_axis(candidates, latest_jumps, axis=1)
+
+        self._last_steps[plants] = steps[:, -1]
+        self._last_walk[plants] = walk[:, -1]
         levels: Values = steps + walk
         return levels
 
@@ -380,16 +346,20 @@ class Signals(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Parameters, num_envs: int = 1, block: int = BLOCK) -> Signals:
-        """Make the signals of an environment, with `block` samples of noise at a time."""
-        noises = {n: Noise(n, c, num_envs, block) for n, c in colours(parameters).items()}
+        """Return the signals of an environment; `block` samples of noise are made at a time."""
+        noises: dict[str, Noise] = {}
+        for name, c in colours(parameters).items():
+            noises[name] = Noise(name, c, num_envs, block)
         return cls(
-            SetPoint(parameters, num_envs),
-            noises.get("noise"),
-            Disturbance(num_envs) if parameters.is_disturbed else None,
-            noises.get("measurement_noise"),
+            setpoint=SetPoint(parameters, num_envs),
+            noise=noises.get("noise"),
+            disturbance=Disturbance(num_envs) if parameters.is_disturbed else None,
+            measurement_noise=noises.get("measurement_noise"),
         )
 
-    def reset(self, which: Indices, streams: Sources, numbers: PlantNumbers[Values]) -> Values:
+    def reset(
+        self, which: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
+    ) -> Values:
         """Begin an episode of some plants, and return y_d(0); the other signals start at 0."""
         for signal in (self.noise, self.disturbance, self.measurement_noise):
             if signal is not None:
@@ -398,5 +368,10 @@ class Signals(NamedTuple):
 
     def ahead(self) -> list[tuple[float, ...]]:
         """Return y_d, n, w and the measurement noise of one plant, one tuple per sample."""
-        silence = [0.0] * BLOCK
-        return list(zip(*(each.ahead() if each else silence for each in self), strict=True))
+        columns: list[list[float]] = []
+        for signal in self:
+            if signal is None:
+                columns.append([0.0] * BLOCK)
+            else:
+                columns.append(signal.ahead())
+        return list(zip(*columns, strict=True))

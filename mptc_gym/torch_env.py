@@ -23,17 +23,16 @@ from mptc_gym.checks import is_count, one_of, reject
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import action_from_command
 from mptc_gym.signals import Levels
-from mptc_gym.torch_plant import TorchPlants
-from mptc_gym.torch_signals import (
+from mptc_gym.torch_episodes import (
     LONGEST,
     SIGNALS,
     Episodes,
     Given,
-    Signal,
     as_tensor,
-    make_signals,
     read_signals,
 )
+from mptc_gym.torch_plant import TorchPlants
+from mptc_gym.torch_signals import Signal, make_signals
 
 _IN_CACHE = 1 << 17  # numbers processed at once
 

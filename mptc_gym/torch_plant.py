@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from mptc_gym.parameters import Parameters, PlantNumbers
 from mptc_gym.plant import DRIFT_INTERVAL, Dynamics, least_effective
-from mptc_gym.torch_signals import Episodes, Number
+from mptc_gym.torch_episodes import Episodes, Number
 
 
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
@@ -22,69 +22,94 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     Its gradient is 1 within the limits, also in the dead zone, and 0 beyond. Commands of a
     magnitude above `edge` have an effect. The limits are both floats, or both of shape (n,).
     """
-    alike = isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
-    if alike and not command.requires_grad and u_min <= 0.0 <= u_max:
+    are_floats = (
+        isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
+    )
+    if are_floats and not command.requires_grad and u_min <= 0.0 <= u_max:
+        # The fastest way to the same numbers.
         shrunk = functional.hardshrink(command, edge)  # type: ignore[arg-type]  # it is a float
-        return shrunk.clamp_(u_min, u_max)  # type: ignore[arg-type]  # the same, at once
+        return shrunk.clamp_(u_min, u_max)  # type: ignore[arg-type]
     limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
-    # 0 inside the dead zone and 1 outside: a product is much faster than an unpredictable
-    # branch.
+    # 1 where the command passes the dead zone, otherwise 0: a product is much faster than an
+    # unpredictable branch.
     if not command.requires_grad:
         return limited.mul_(command.abs().gt_(edge))
     passes = command.detach().abs().gt_(edge)
+    # limited + constant * (passes - 1): the same value, but with the gradient of `limited`.
     return torch.addcmul(limited, limited.detach(), passes.sub_(1.0))
 
 
 class TorchPlants:
     """Many plants side by side, with gradients where the actions have them.
 
-    With d the shortest delay that can be drawn, the outputs of the d + 1 samples after an
-    action follow from the actions so far, and are computed in a block of `most_samples`.
+    Attributes
+    ----------
+    most_samples : int
+        d + 1, with d the shortest delay that can be drawn: so many outputs after an action
+        follow from the actions so far, and can be computed in one block.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
-        self._episodes, self._zeros = episodes, episodes.zeros
+        self._episodes = episodes
+        self._zeros = episodes.zeros
         self._dynamics = Dynamics(parameters)
-        self._drifts, self._scales = parameters.drifts, parameters.changes_dynamics
+        self._drifts = parameters.drifts
+        self._changes_dynamics = parameters.changes_dynamics
         self._drift_samples = parameters.drift_samples
         self._beta = tuple(parameters.b)
         shortest, self._longest = map(int, parameters.range_of("delay"))
         self.most_samples = shortest + 1
         self._order = len(parameters.a) - 1  # of A
-        # Flows that have yet to take effect, for all terms of B; and outputs, those of the
-        # latest block and those that A needs from before it. Both have the oldest first.
+        # The flows that terms of B still need, the oldest first.
         flows = self._longest + len(self._beta)
         self._flows = deque([self._zeros] * flows, flows)
+        # The outputs that A needs from before the latest block, then those of the block.
         self._outputs = [self._zeros] * self._order
 
     def reset(self, mask: Tensor) -> None:
         """Bring some plants to rest, with the numbers of the current episodes."""
-        numbers, zeros = self._episodes.numbers, self._zeros
-        self._now: tuple[Any, Any] | None = None  # factors and coefficients of (28)
-        plants = PlantNumbers(**numbers)
-        self._factors = self._dynamics.factors(plants, 0)
+        used_outputs = self._outputs[: len(self._outputs) - self._episodes.unused]
+        self._outputs = [output.masked_fill(mask, 0.0) for output in used_outputs]
+        self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
+        self._reset_dynamics()
+        self._reset_actuator()
+        self._reset_delays()
+
+    def _reset_dynamics(self) -> None:
+        """Compute the factors of gain and time constant at k = 0, and their drifts."""
+        numbers = PlantNumbers(**self._episodes.numbers)
+        self._factors = self._dynamics.factors(numbers, 0)
         if self._drifts:
             # The factors at the start of the drifts, and their total change.
-            last = self._dynamics.factors(plants, self._drift_samples)
+            final_factors = self._dynamics.factors(numbers, self._drift_samples)
             self._drift = [
-                (zeros + begin, zeros + (end - begin))
-                for begin, end in zip(self._factors, last, strict=True)
+                (self._zeros + initial, self._zeros + (final - initial))
+                for initial, final in zip(self._factors, final_factors, strict=True)
             ]
-        used = self._outputs[: len(self._outputs) - self._episodes.unused]
-        self._outputs = [each.masked_fill(mask, 0.0) for each in used]
-        self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
-        self._limits = u_min, u_max = numbers["u_min"], numbers["u_max"]
-        self._middle = zeros.new_zeros(()) + (u_min + u_max) / 2.0
+        # The present factors and coefficients of (28), if they are known.
+        self._present: tuple[Any, Any] | None = None
+
+    def _reset_actuator(self) -> None:
+        """Compute what `apply` needs of the actuator's numbers."""
+        numbers = self._episodes.numbers
+        u_min = numbers["u_min"]
+        u_max = numbers["u_max"]
+        self._limits = u_min, u_max
+        self._middle = self._zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
-        rounding = 2.0**-21 if zeros.dtype == torch.float32 else 2.0**-50
+        rounding = 2.0**-21 if self._zeros.dtype == torch.float32 else 2.0**-50
         self._edge = least_effective(numbers["dead_zone"], u_min, u_max, rounding)
-        delay, n = numbers["delay"], len(zeros)
-        self._places = None  # of each plant's delayed flows, where delays differ
+
+    def _reset_delays(self) -> None:
+        """Compute where the delayed flows of each plant lie in all flows, if delays differ."""
+        self._places: Tensor | None = None  # in the flattened flows
+        delay = self._episodes.numbers["delay"]
         if isinstance(delay, Tensor):
+            n = len(self._zeros)
             columns = torch.arange(n, device=delay.device)
             rows = torch.arange(self.most_samples + len(self._beta) - 1, device=delay.device)
-            oldest = self._longest - delay.to(torch.int64)
-            self._places = (rows[:, None] + oldest) * n + columns
+            first_rows = self._longest - delay.to(torch.int64)
+            self._places = (rows[:, None] + first_rows) * n + columns
 
     def apply(self, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Apply a(k) of all plants, shape (n,), and return u(k) and u_a(k), t/h."""
@@ -93,7 +118,7 @@ class TorchPlants:
         if actions.dtype == torch.float64:
             command = actions.add(1.0).mul_(self._half_range).add_(u_min)
         else:
-            command = _plus(self._middle, self._half_range, actions)
+            command = _add_product(self._middle, self._half_range, actions)
         applied = applied_flow(command, self._edge, u_min, u_max)
         self._flows.append(applied.clone())  # as the caller may overwrite what is returned
         return command, applied
@@ -103,36 +128,53 @@ class TorchPlants:
     ) -> tuple[Tensor, list[tuple[Number, Number]]]:
         """Compute the outputs of the next samples, after the action before them was applied.
 
-        n and w, if any, and y have the shape (samples, n), degC. Also return gain and time
-        constant at each sample, as multiples of those of A and B.
+        Parameters
+        ----------
+        samples
+            Length of the block, at most `most_samples`.
+        noise, load
+            n and w, degC, shape (samples, n); None if they are always 0.
+
+        Returns
+        -------
+        Tensor
+            y, degC, shape (samples, n).
+        list of tuple
+            Gain and time constant at each sample, as multiples of those of A and B.
         """
-        rows, all_factors = self._outputs[len(self._outputs) - self._order :], []
+        outputs = self._outputs[len(self._outputs) - self._order :]
+        all_factors: list[tuple[Number, Number]] = []
         response = self._response(samples)
-        due = self._episodes.any_due if self._drifts else (lambda row: False)
-        begins = [k for k in range(samples) if k == 0 or due(k)]
-        for first, last in pairwise([*begins, samples]):
-            if self._now is None or due(first):
-                self._now = self._dynamics_at(first)
-            factors, (alpha, scale, load_gain) = self._now
-            forced = response[first:last]
+        # The coefficients are constant from each of these rows to the next.
+        boundaries = [row for row in range(samples) if row == 0 or self._has_drifted(row)]
+        for first, end in pairwise([*boundaries, samples]):
+            if self._present is None or self._has_drifted(first):
+                self._present = self._dynamics_at(first)
+            factors, (alpha, scale, load_gain) = self._present
+            all_factors += [factors] * (end - first)
+            forced = response[first:end]
             if noise is not None:
-                forced = _plus(noise[first:last], scale, forced)
-            elif self._scales:
+                forced = _add_product(noise[first:end], scale, forced)
+            elif self._changes_dynamics:
                 forced = forced * scale
             if load is not None:
-                forced = _plus(forced, load_gain, load[first:last])
-            all_factors += [factors] * (last - first)
-            for output in forced.unbind():
+                forced = _add_product(forced, load_gain, load[first:end])
+            for forced_row in forced.unbind():
+                output = forced_row
                 for lag, coefficient in enumerate(alpha, start=1):
-                    output = _plus(output, coefficient, rows[-lag])
-                rows.append(output)
-        self._outputs = rows
-        return torch.stack(rows[self._order :]), all_factors
+                    output = _add_product(output, coefficient, outputs[-lag])
+                outputs.append(output)
+        self._outputs = outputs
+        return torch.stack(outputs[self._order :]), all_factors
+
+    def _has_drifted(self, row: int) -> bool:
+        """Return whether the dynamics of some plant change at a row of the block."""
+        return self._drifts and self._episodes.any_due(row)
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions."""
-        self._outputs = [each.detach() for each in self._outputs]
-        self._flows.extend([each.detach() for each in self._flows])
+        self._outputs = [output.detach() for output in self._outputs]
+        self._flows.extend([flow.detach() for flow in self._flows])
 
     def _response(self, samples: int) -> Tensor:
         """Return the response to the flows, B of (28), shape (samples, n)."""
@@ -140,9 +182,10 @@ class TorchPlants:
         if self._places is None:
             flows = torch.stack([*islice(self._flows, needed)])
         else:
-            past = self._longest - self.most_samples + 1
-            flows = torch.stack([*islice(self._flows, past + needed)]).reshape(-1)
-            flows = flows.index_select(0, self._places[:needed].reshape(-1)).view(needed, -1)
+            older = self._longest - self.most_samples + 1
+            all_flows = torch.stack([*islice(self._flows, older + needed)]).reshape(-1)
+            places = self._places[:needed].reshape(-1)
+            flows = all_flows.index_select(0, places).view(needed, -1)
         response = flows[-samples:] * self._beta[0]
         for lag, coefficient in enumerate(self._beta[1:], start=1):
             earlier = flows[needed - samples - lag : needed - lag]
@@ -157,11 +200,13 @@ class TorchPlants:
             if isinstance(age, Tensor):
                 age = age.to(self._zeros.dtype)
             share = self._dynamics.share(age - age % DRIFT_INTERVAL)
-            factors = tuple(_plus(first, share, more) for first, more in self._drift)
+            factors = tuple(
+                _add_product(initial, share, change) for initial, change in self._drift
+            )
         return factors, self._dynamics.coefficients(*factors)
 
 
-def _plus(first: Tensor, factor: Number, second: Tensor) -> Tensor:
+def _add_product(first: Tensor, factor: Number, second: Tensor) -> Tensor:
     """Return first + factor * second, in one operation."""
     if isinstance(factor, Tensor):
         return torch.addcmul(first, factor, second)

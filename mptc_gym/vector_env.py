@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 
 from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.checks import is_count, many_actions, one_of, plain, reject
+from mptc_gym.draws import Ranges, Streams, plant_numbers
 from mptc_gym.env import NO_MODE, Frame, MiddlePointEnv
 from mptc_gym.parameters import spelt_out
 from mptc_gym.plant import PlantBatch, action_from_command
 from mptc_gym.record import Record
-from mptc_gym.signals import BLOCK, Indices, Ranges, Signals, Streams, Values, plant_numbers
+from mptc_gym.signals import BLOCK, Indices, Signals, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 
-NOISE_BYTES = 1 << 27  # at most, in a block of noise, unless one sample takes more
+NOISE_BYTES = 1 << 27  # largest block of noise, unless a single sample of all plants takes more
 STEPS_PER_SHIFT = 64  # steps after which the window of observations is moved back
 
 
@@ -43,12 +44,14 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     autoreset_mode
         An `AutoresetMode` or its value. "NextStep": the step after the end of an episode resets
         the plant, and its action is ignored. "SameStep": the step that ends an episode resets
-        the plant, and returns the last observation and info in `final_obs` and `final_info`.
+        the plant, and its infos hold the last observation and info of the episode as
+        `final_obs` and `final_info`.
         "Disabled": the caller resets ended plants with `reset(options={"reset_mask": mask})`.
     render_mode
         None, or "rgb_array": `render` returns a picture of each plant.
     **arguments
-        Those of `MiddlePointEnv`, the same for all plants; each draws its own from a range.
+        The arguments of `MiddlePointEnv`. They are the same for all plants, but where one is a
+        range, every plant draws a number of its own.
 
     Raises
     ------
@@ -59,9 +62,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
     Notes
     -----
-    `reset(seed=)` restarts the random streams of plant i with seed + i, or with element i of a
-    list. Without a seed, or where the list holds None, the next episode of the current streams
-    begins. Rewards are float64, and observations float32.
+    `reset(seed=seed)` restarts the random streams of plant i with seed + i, or with element i
+    if the seed is a list. Without a seed, or where the list holds None, the next episode of the
+    current streams begins. Rewards are float64, and observations float32.
 
     All plants share one clock, so that a step is array arithmetic alone. There is a Python loop
     over plants only where each draws from its own generators: at the start of an episode, once
@@ -102,11 +105,13 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._actions = np.zeros(num_envs)  # of the last step
         # Arrays instead of numbers, for speed, as in `PlantBatch`.
         self._zeros = np.zeros(num_envs)
-        self._everyone, self._nobody = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
+        self._all_true = np.ones(num_envs, np.bool_)
+        self._all_false = np.zeros(num_envs, np.bool_)
         span = parameters.temperature_span
         self._span = np.full(num_envs, -span), np.full(num_envs, span), span * span
-        quadratic, scale = parameters.reward == "quadratic", np.array(parameters.error_scale)
-        self._reward_terms = scale, np.array(-0.5), quadratic, parameters.move_weight
+        quadratic = parameters.reward == "quadratic"
+        error_scale = np.array(parameters.error_scale)
+        self._reward_terms = error_scale, np.array(-0.5), quadratic, parameters.move_weight
 
     __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
@@ -116,9 +121,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return tuple(self._seeds)
 
     def render(self) -> tuple[Frame, ...] | None:
-        """Return a picture of each plant, shape (540, 960, 3), as `MiddlePointEnv` does of one.
+        """Return a picture of each plant, shape (540, 960, 3); see `MiddlePointEnv.render`.
 
-        None without a render mode, after a warning.
+        Without a render mode, return None, after a warning.
         """
         if self.render_mode is None:
             logger.warn(NO_MODE)
@@ -131,10 +136,14 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
     def _advance(self, a: Values) -> tuple[Observations, Values, Mask, Mask, Infos]:
         # This is the hot path: for few plants, the number of calls determines its speed.
-        of_setpoint, of_noise, of_load, of_transmitter = self._signals
-        setpoint = of_setpoint.next()
-        noise = self._zeros if of_noise is None else of_noise.next()
-        load = None if of_load is None else of_load.next()
+        signals = self._signals
+        setpoint = signals.setpoint.next()
+        noise = self._zeros
+        if signals.noise is not None:
+            noise = signals.noise.next()
+        load = None
+        if signals.disturbance is not None:
+            load = signals.disturbance.next()
         command, applied, output = self._plants.step(a, noise, load)
         error = setpoint - output
 
@@ -149,46 +158,49 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             rewards -= move_weight * np.abs(a - self._actions)
         self._actions = a
 
-        measured, measured_error = output, error
-        if of_transmitter is not None:
-            measured = output + of_transmitter.next()
+        measured = output
+        measured_error = error
+        if signals.measurement_noise is not None:
+            measured = output + signals.measurement_noise.next()
             measured_error = setpoint - measured
-        lowest, highest, squared = self._span
+        lowest, highest, squared_span = self._span
         # If the sum of squares is at most the span squared, no reading is beyond the span.
-        if not measured.dot(measured) <= squared:
+        if not measured.dot(measured) <= squared_span:
             measured = np.fmin(measured, highest)  # which turns NaN into the limit
             np.fmax(measured, lowest, out=measured)
             measured_error = setpoint - measured
         observations = self._shown.add(setpoint, measured_error, measured, a)
         if self._records:
             columns = (values.tolist() for values in (setpoint, output, command, applied))
-            for i, numbers in enumerate(zip(*columns, strict=True)):
-                self._records[i].add(*numbers)
+            for i, sample in enumerate(zip(*columns, strict=True)):
+                self._records[i].add(*sample)
 
-        everyone = self._everyone.copy()
+        mask = self._all_true.copy()
         infos = {  # written out, which is fastest
             "output": output.copy(),
-            "_output": everyone,
+            "_output": mask,
             "setpoint": setpoint.copy(),
-            "_setpoint": everyone,
+            "_setpoint": mask,
             "error": error,
-            "_error": everyone,
+            "_error": mask,
             "command": command,
-            "_command": everyone,
+            "_command": mask,
             "applied": applied,
-            "_applied": everyone,
+            "_applied": mask,
             "noise": noise.copy(),
-            "_noise": everyone,
+            "_noise": mask,
         }
         if load is not None:
-            infos["disturbance"], infos["_disturbance"] = load.copy(), everyone
+            infos["disturbance"] = load.copy()
+            infos["_disturbance"] = mask
         if self._factor_names:
             for name, factors in zip(self._factor_names, self._plants.factors, strict=True):
-                infos[name], infos[f"_{name}"] = factors.copy(), everyone
-        return observations, rewards, self._nobody.copy(), self._nobody.copy(), infos
+                infos[name] = factors.copy()
+                infos[f"_{name}"] = mask
+        return observations, rewards, self._all_false.copy(), self._all_false.copy(), infos
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
-        which, parameters = np.flatnonzero(mask), self.parameters
+        which = np.flatnonzero(mask)
         numbers = self._ranges.draw([self._streams[i] for i in which.tolist()])
         self._plants.reset(which, numbers)
         setpoint = self._signals.reset(which, self._streams, numbers)
@@ -196,43 +208,53 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._actions[which] = rest_action
         self._shown.reset(which, setpoint, rest_action)
         if self.render_mode is not None:
-            for j, i in enumerate(which.tolist()):
-                own, interval = plant_numbers(numbers, j), parameters.sampling_interval
-                self._records[i] = Record(own, interval, setpoint[j].item())
+            interval = self.parameters.sampling_interval
+            for place, i in enumerate(which.tolist()):
+                numbers_of_plant = plant_numbers(numbers, place)
+                self._records[i] = Record(numbers_of_plant, interval, setpoint[place].item())
 
-        first = {"setpoint": setpoint, "error": setpoint}
-        first |= numbers.chosen(self._ranges.names)
-        of_all = dict(zip(self._factor_names, self._plants.factors, strict=False))
-        for name, values in first.items():
-            of_all[name] = np.zeros(self.num_envs, values.dtype)
-            of_all[name][which] = values
-        return of_all
+        infos: dict[str, NDArray[Any]] = {}
+        if self._factor_names:
+            infos.update(zip(self._factor_names, self._plants.factors, strict=True))
+        infos_of_which = {"setpoint": setpoint, "error": setpoint}
+        infos_of_which |= numbers.chosen(self._ranges.names)
+        for name, values in infos_of_which.items():
+            infos[name] = np.zeros(self.num_envs, values.dtype)
+            infos[name][which] = values
+        return infos
 
     def _final(self, ended: Mask, observations: Observations) -> NDArray[np.object_]:
-        final = np.full(self.num_envs, None, object)
+        final_observations = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(ended):
-            final[i] = observations[i].copy()
-        return final
+            final_observations[i] = observations[i].copy()
+        return final_observations
 
     def _flags(self, mask: Mask) -> Mask:
         return mask.copy()
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        n, seeds = self.num_envs, plain(seed)
-        if seed is None or is_count(seed):
-            seeds = [None] * n if seed is None else range(int(seed), int(seed) + n)
-        else:
-            fits = isinstance(seeds, list | tuple) and len(seeds) == n
-            if not fits or not all(each is None or is_count(each) for each in seeds):
-                allowed = f"an integer of at least 0, or a list of {n} of them or None"
-                reject("seed", seed, allowed)
+        seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():
-            own = seeds[i]
-            if own is None and i not in self._streams:
-                own = np.random.SeedSequence().entropy
-            if own is not None:
-                self._seeds[i] = int(own)
-                self._streams[i] = Streams.of_seed(int(own))
+            seed_of_plant = seeds[i]
+            if seed_of_plant is None and i not in self._streams:
+                seed_of_plant = np.random.SeedSequence().entropy
+            if seed_of_plant is not None:
+                self._seeds[i] = int(seed_of_plant)
+                self._streams[i] = Streams.of_seed(int(seed_of_plant))
+
+    def _checked_seeds(self, seed: Any) -> Sequence[Any]:
+        """Return a seed for each plant, or None for plants whose streams continue."""
+        n = self.num_envs
+        if seed is None:
+            return [None] * n
+        if is_count(seed):
+            return range(int(seed), int(seed) + n)
+        seeds = plain(seed)
+        is_list = isinstance(seeds, list | tuple) and len(seeds) == n
+        if not is_list or not all(element is None or is_count(element) for element in seeds):
+            allowed = f"an integer of at least 0, or a list of {n} of them or None"
+            reject("seed", seed, allowed)
+        return list(seeds)
 
     def _checked_actions(self, actions: Any) -> Values:
         return many_actions(actions, self.num_envs, self._ended)
@@ -241,19 +263,24 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 class _Window:
     """The observations of all plants.
 
-    They lie in a row, one after another, from a place that moves back by one each step. So all
-    blocks of samples shift by one, and only their first elements have to be written.
+    An observation has four blocks: set points, errors, outputs and actions, each with the
+    newest first. The observations lie one after another in a row of memory, from a place that
+    moves back by one element at each step. So the samples of all blocks shift by one without
+    being copied, and only the first element of each block has to be written.
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
         heads = np.cumsum([0, *windows[:-1]]).tolist()
-        # Of each block with samples: its number, and the place of the newest one.
-        self._newest = [(i, np.s_[:, heads[i]]) for i, window in enumerate(windows) if window]
-        self._actions = np.s_[:, heads[-1] :]
+        # Indices of the newest sample of a block in all observations; None for an empty block.
+        self._setpoints, self._errors, self._outputs, self._actions = (
+            np.s_[:, head] if window else None
+            for head, window in zip(heads, windows, strict=True)
+        )
+        self._all_actions = np.s_[:, heads[-1] :]
         self._shape = num_envs, sum(windows)
         self._elements = num_envs * sum(windows)
         self._row = np.zeros(self._elements + STEPS_PER_SHIFT, np.float32)
-        self._place = STEPS_PER_SHIFT
+        self._place = STEPS_PER_SHIFT  # of the first observation in the row
 
     def present(self) -> Observations:
         """Return the current observations."""
@@ -263,21 +290,30 @@ class _Window:
         return self._row[self._place : self._place + self._elements].reshape(self._shape)
 
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
-        """Begin an episode of some plants at rest, with y_d(0) and the action of no flow."""
-        rest = np.zeros((len(which), self._shape[1]), np.float32)
-        rest[self._actions] = np.reshape(np.clip(rest_action, -1.0, 1.0), (-1, 1))
-        for i, newest in self._newest:
-            if i < 2:  # set points and errors
-                rest[newest] = setpoint
-        self._view()[which] = rest
+        """Begin an episode of some plants at rest, with y_d(0) and the action for no flow."""
+        observations = np.zeros((len(which), self._shape[1]), np.float32)
+        observations[self._all_actions] = np.reshape(np.clip(rest_action, -1.0, 1.0), (-1, 1))
+        if self._setpoints is not None:
+            observations[self._setpoints] = setpoint
+        if self._errors is not None:
+            observations[self._errors] = setpoint
+        self._view()[which] = observations
 
-    def add(self, *samples: Values) -> Observations:
-        """Add set points, errors, outputs and actions, and return the observations."""
+    def add(
+        self, setpoint: Values, error: Values, output: Values, action: Values
+    ) -> Observations:
+        """Add a sample of all plants, each of shape (n,), and return the observations."""
         if self._place == 0:
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]
             self._place = STEPS_PER_SHIFT
         self._place -= 1
-        window = self._row[self._place : self._place + self._elements].reshape(self._shape)
-        for i, newest in self._newest:
-            window[newest] = samples[i] if i < 3 else samples[i].clip(-1.0, 1.0)
-        return window.copy()
+        observations = self._view()
+        if self._setpoints is not None:
+            observations[self._setpoints] = setpoint
+        if self._errors is not None:
+            observations[self._errors] = error
+        if self._outputs is not None:
+            observations[self._outputs] = output
+        if self._actions is not None:
+            observations[self._actions] = action.clip(-1.0, 1.0)
+        return observations.copy()

@@ -20,8 +20,8 @@ from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
+from mptc_gym.draws import Ranges
 from mptc_gym.plant import action_from_command
-from mptc_gym.signals import Ranges
 from tests.verify_bounds import CONTROLLERS, beats, errors
 
 CALM = Parameters()
@@ -40,7 +40,7 @@ def minimum_variance(parameters):
 
 def course_of(samples, **arguments):
     parameters = Parameters(**arguments)
-    return LinearModel(parameters, Ranges(parameters).given, np.arange(samples))
+    return LinearModel(parameters, Ranges(parameters).lowest, np.arange(samples))
 
 
 def best_plan(setpoint, /, **arguments):

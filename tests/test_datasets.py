@@ -57,13 +57,14 @@ def test_a_set_is_replayed_and_scores_a_learner(minari, tmp_path, capsys):
 
 
 def sha256(plant, episodes):
-    about = [
+    metadata = [
         datasets.arguments_of(plant),
-        *([each[name] for each in episodes] for name in ("controller", "seed")),
+        [episode.controller for episode in episodes],
+        [episode.seed for episode in episodes],
     ]
-    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
     for name in ("observations", "actions", "rewards"):
-        array = np.stack([each[name] for each in episodes])
+        array = np.stack([getattr(episode, name) for episode in episodes])
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         digest.update(repr(array.shape).encode() + little.tobytes())
     return digest.hexdigest()

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 import mptc_gym
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, drawing
+from mptc_gym.draws import Ranges
 from mptc_gym.parameters import Parameters
 from mptc_gym.record import Record
-from mptc_gym.signals import Ranges
 from tests.conftest import MODES, NOISY, native_and_sync
 
 SHAPE = (540, 960, 3)
@@ -29,7 +29,7 @@ LEFT, TOP, WIDTH, _ = drawing.FLOWS
 
 def record(*samples, sampling_interval=8.0, **numbers):
     """Return a record of samples (y_d, y, u, u_a) of the paper's plant, or one unlike it."""
-    paper = Ranges(Parameters()).given
+    paper = Ranges(Parameters()).lowest
     made = Record(replace(paper, **numbers), sampling_interval, 0.0)
     for sample in samples:
         made.add(*sample)
@@ -46,9 +46,9 @@ def test_curves_and_marks_are_where_the_axes_say(delay, dead_zone, u_max):
 
     def ends(colour, k):
         """Return the highest and the lowest value with a colour, in the axes of its panel."""
-        (low, high), panel = made.flows, drawing.FLOWS
+        (low, high), panel = made.flow_axis, drawing.FLOWS
         if colour in (drawing.TEMPERATURE, drawing.SETPOINT):
-            (low, high), panel = made.temperatures, drawing.TEMPERATURES
+            (low, high), panel = made.temperature_axis, drawing.TEMPERATURES
         found = np.flatnonzero(
             (picture[:, round(LEFT + k / 200 * WIDTH)] == colour).all(axis=1)
         )
@@ -58,7 +58,7 @@ def test_curves_and_marks_are_where_the_axes_say(delay, dead_zone, u_max):
     for k, sample in ((30.5, early), (100.5, late)):
         colours = drawing.SETPOINT, drawing.TEMPERATURE, drawing.COMMAND, drawing.APPLIED
         for colour, value in zip(colours, sample, strict=True):
-            shown = made.flows[1] if value == 100.0 else value  # the edge of the panel
+            shown = made.flow_axis[1] if value == 100.0 else value  # the edge of the panel
             assert ends(colour, k) == pytest.approx(shown, abs=0.5)
     for colour in (drawing.COMMAND, drawing.APPLIED):
         assert np.ptp(ends(colour, 60)) > 2.0  # from u(59) to u(60), at once
@@ -208,5 +208,5 @@ def test_anything_can_be_drawn(samples, delay, dead_zone, limits, sampling_inter
         sampling_interval=sampling_interval,
     )  # fmt: skip
     assert drawing.frame(made).shape == SHAPE
-    for axis in (made.temperatures, made.flows):
+    for axis in (made.temperature_axis, made.flow_axis):
         assert 2 <= len(drawing.ticks(*axis)) <= 8

@@ -139,7 +139,7 @@ def test_copies_in_the_middle_of_an_episode_go_on_alike(copied, mode, rng):
     assert data_equivalence(env.reset(), twin.reset(), exact=True)
 
 
-def test_seeds_are_told():
+def test_the_seed_of_each_plant_can_be_read():
     envs = MiddlePointVectorEnv(3)
     assert envs.np_random_seed == (None, None, None)
     envs.reset()

@@ -27,9 +27,9 @@ from benchmarks.loop.rollout import (
     rollout,
 )
 from mptc_gym import Parameters
+from mptc_gym.draws import plant_numbers
 from mptc_gym.evaluation import EPISODES, SEED
 from mptc_gym.parameters import PlantNumbers
-from mptc_gym.signals import plant_numbers
 
 Array = NDArray[np.float64]
 

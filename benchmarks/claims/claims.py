@@ -1,5 +1,5 @@
 """Examine the paper's claims: the runs for each, and the criteria that it must meet."""
-# ruff: noqa: B023, D103 (closures are called at once; what each function does stands above it)
+# ruff: noqa: D103 (`claimed` says what each function examines)
 
 import itertools
 import math
@@ -9,14 +9,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.polynomial.polynomial import polyadd
 
-from agents import PIController
+from agents import DirectNNController
 from agents.pi import SEARCHED_GAINS
-from benchmarks.claims.runs import OFTEN, Array, Batch, Finding, judge, judge_share, judge_time
+from benchmarks.claims.measures import WeightLog, converged_at, largest_pole
+from benchmarks.claims.runs import (
+    OFTEN,
+    Batch,
+    Finding,
+    Gains,
+    judge,
+    judge_share,
+    judge_time,
+    judge_worst,
+)
 from benchmarks.loop import linear
 from benchmarks.loop.rollout import mean_error, settled
-from benchmarks.loop.scenarios import SETPOINTS as CASES
+from benchmarks.loop.scenarios import SETPOINTS as PAPER_SETPOINTS
+from benchmarks.loop.scenarios import Arguments, Scenario
 from mptc_gym import PRESETS, Parameters
 
 # The meaning of words, fixed before the numbers were known and the same for all claims.
@@ -24,17 +34,21 @@ NOTABLE = 0.05  # a smaller relative change of an error is not notable
 MUCH = 0.2  # "much better", "seriously worse": the error differs by at least this share
 SOON = 150  # samples; the paper's own number for the convergence of the weights
 
+SAMPLES = 1200  # of a run, unless the case says otherwise
 NOISY = PRESETS["noisy"]
 NOISY_SQUARE = "square wave, R = 0.5 °C²"
-SQUARE, CONSTANT = (arguments for *_, arguments in CASES)
 # The constant set point comes first, as it shows initial learning alone.
-SETPOINTS = tuple((title, arguments, samples) for _, title, samples, arguments in CASES[::-1])
-KP, KI = PAPER_PI = (2.2, 0.3)
-SEARCHED_PI = (SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
+SETPOINTS = PAPER_SETPOINTS[::-1]
+CONSTANT, SQUARE = (setpoint.arguments for setpoint in SETPOINTS)
 LEARNING = 600  # samples after which a network counts as trained
-GAINS = {False: "the same gains", True: "gains in proportion"}  # of networks of other shapes
+# How a network of another shape learns, by whether its gains are scaled down.
+GAINS = {False: "the same gains", True: "gains in proportion"}
 
 Findings = Iterable[Finding]
+
+
+PAPER_PI = Gains(2.2, 0.3)
+SEARCHED_PI = Gains(SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
 
 
 class Claim(NamedTuple):
@@ -50,23 +64,24 @@ CLAIMS: dict[str, Claim] = {}
 
 
 def claimed(
-    section: str, statement: str, method: str, name: str = "", **given: Any
+    section: str, statement: str, method: str, name: str = "", **arguments: Any
 ) -> Callable[[Callable[..., Findings]], Callable[..., Findings]]:
-    """Register a claim of the paper, by default under the name of what examines it.
+    """Return a decorator that registers a claim with the function that examines it.
 
-    `given` are further arguments of the examination. Of two decorators the lower is the first.
+    The claim's name is by default that of the function. `arguments` are passed to the function,
+    besides the batch. If a function has two decorators, the lower one registers first.
     """
 
-    def enter(examine: Callable[..., Findings]) -> Callable[..., Findings]:
-        known = name or examine.__name__.replace("_", "-")
-        CLAIMS[known] = Claim(section, statement, method, partial(examine, **given))
+    def register(examine: Callable[..., Findings]) -> Callable[..., Findings]:
+        claim_name = name or examine.__name__.replace("_", "-")
+        CLAIMS[claim_name] = Claim(section, statement, method, partial(examine, **arguments))
         return examine
 
-    return enter
+    return register
 
 
 def examined(name: str, batch: Batch) -> list[Finding]:
-    """Return what is found about a claim."""
+    """Return the findings about a claim, from runs of a batch."""
     return list(CLAIMS[name].examine(batch))
 
 
@@ -77,38 +92,17 @@ def examined(name: str, batch: Batch) -> list[Finding]:
     "at the start, for the last 100 samples at the least.",
 )
 def convergence(batch: Batch) -> Findings:
-    for name, arguments, samples in SETPOINTS:
-        network = batch.networks()
-        weights: list[Array] = []
-
-        def watch(_: int) -> None:
-            arrays = vars(network.weights).values()
-            flat = [each.reshape(batch.runs, -1) for each in arrays]
-            weights.append(np.hstack(flat, dtype=np.float32))
-
-        batch.run(network, samples, watch, **arguments)
-        times = converged_at(np.array(weights))
+    for setpoint in SETPOINTS:
+        networks = batch.networks()
+        log = WeightLog(networks)
+        batch.run(networks, setpoint.samples, log, **setpoint.arguments)
+        times = converged_at(np.array(log.rows))
+        title = setpoint.title
         soon = times <= SOON
-        yield judge_share(f"weights converged within {SOON} samples, {name}", soon, often=True)
-        yield from judge_time(f"time until the weights have converged, {name}", times)
+        yield judge_share(f"weights converged within {SOON} samples, {title}", soon, often=True)
+        yield from judge_time(f"time until the weights have converged, {title}", times)
         never = np.isinf(times)
-        yield judge_share(f"weights not converged when the run ends, {name}", never)
-
-
-def converged_at(weights: Array) -> Array:
-    """Return the sample at which weights have converged, shape (runs,).
-
-    This is the first sample from which on their Euclidean distance to their final values is at
-    most 5 % of that at the start. It is infinite for weights that come so close only in the
-    last 100 samples: they have not converged, as the run might end anywhere on their way.
-    `weights` are those before each sample, shape (samples, runs, n).
-    """
-    distance = np.linalg.norm(weights - weights[-1], axis=2)
-    outside = distance > 0.05 * distance[0]
-    samples = len(weights)
-    # The first sample of the final stretch inside the band, found from the end.
-    first = np.where(outside.any(axis=0), samples - np.argmax(outside[::-1], axis=0), 0)
-    return np.where(first <= samples - 100, first, np.inf)
+        yield judge_share(f"weights not converged when the run ends, {title}", never)
 
 
 @claimed(
@@ -118,16 +112,18 @@ def converged_at(weights: Array) -> Array:
     "the mean error is larger by a fifth or more.",
 )
 def dead_zone(batch: Batch) -> Findings:
-    for name, arguments, samples in SETPOINTS:
-        small = batch.run_nn(samples, **arguments)
-        large = batch.run_nn(samples, **arguments, dead_zone=7.0)
-        quantity = f"settled when the run ends, dead zone 7 t/h, {name}"
+    for setpoint in SETPOINTS:
+        title = setpoint.title
+        small = batch.run_nn(setpoint.samples, **setpoint.arguments)
+        large = batch.run_nn(setpoint.samples, **setpoint.arguments, dead_zone=7.0)
+        quantity = f"settled when the run ends, dead zone 7 t/h, {title}"
         yield judge_share(quantity, settled(large), often=True)
-        cost = mean_error(large) / mean_error(small)
-        quantity = f"mean error at dead zone 7 t/h, as a multiple of that at 5 t/h, {name}"
-        yield judge(quantity, cost, at_least=1 + MUCH)
-        for zone, runs in ((5, small), (7, large)):
-            yield judge(f"mean error, dead zone {zone} t/h, {name}", mean_error(runs), "°C")
+        error_ratio = mean_error(large) / mean_error(small)
+        quantity = f"mean error at dead zone 7 t/h, as a multiple of that at 5 t/h, {title}"
+        yield judge(quantity, error_ratio, at_least=1 + MUCH)
+        for dead_zone, runs in ((5, small), (7, large)):
+            quantity = f"mean error, dead zone {dead_zone} t/h, {title}"
+            yield judge(quantity, mean_error(runs), "°C")
 
 
 @claimed(
@@ -137,23 +133,22 @@ def dead_zone(batch: Batch) -> Findings:
     "more than it does without control; and must be better than doing nothing.",
 )
 def noise(batch: Batch) -> Findings:
-    samples, steady = 1200, slice(-600, None)
-    idle = batch.run_pi(0.0, 0.0, samples, setpoint=0.0, **NOISY)
-    runs = batch.run_nn(samples, **CONSTANT, **NOISY)
-    error = (runs.setpoint - runs.output)[steady]
-    alone = idle.output[steady].std(axis=0)
-    quantity = (
-        "absolute value of the mean of e over the last 600 of 1,200 samples, constant set point"
-    )
-    yield judge(quantity, np.abs(error.mean(axis=0)), "°C", at_most=0.05 * 5.0)
+    steady = slice(-600, None)
+    idle_runs = batch.run_pi(Gains(0.0, 0.0), SAMPLES, setpoint=0.0, **NOISY)
+    idle_deviation = idle_runs.output[steady].std(axis=0)
+    runs = batch.run_nn(SAMPLES, **CONSTANT, **NOISY)
+    errors = (runs.setpoint - runs.output)[steady]
+    quantity = "absolute value of the average error over the last 600 of 1,200 samples, "
+    quantity += "constant set point"
+    yield judge(quantity, np.abs(errors.mean(axis=0)), "°C", at_most=0.05 * 5.0)
     quantity = "standard deviation of y over these samples, as a multiple of that without "
     quantity += "control"
-    yield judge(quantity, error.std(axis=0) / alone, at_most=1 + MUCH)
-    square = mean_error(batch.run_nn(samples, **SQUARE, **NOISY))
-    better = "mean error below that of doing nothing, square wave"
-    yield judge_share(better, square < 5.0, often=True)
-    yield judge("mean error, square wave", square, "°C")
-    yield judge("standard deviation of y without control", alone, "°C")
+    yield judge(quantity, errors.std(axis=0) / idle_deviation, at_most=1 + MUCH)
+    square_errors = mean_error(batch.run_nn(SAMPLES, **SQUARE, **NOISY))
+    quantity = "mean error below that without control, square wave"
+    yield judge_share(quantity, square_errors < 5.0, often=True)
+    yield judge("mean error, square wave", square_errors, "°C")
+    yield judge("standard deviation of y without control", idle_deviation, "°C")
 
 
 @claimed(
@@ -165,48 +160,43 @@ def noise(batch: Batch) -> Findings:
     "twice the paper's Kp.",
 )
 def pi_gains(batch: Batch) -> Findings:
-    paper = batch.run_pi(KP, KI, 1200, **CONSTANT)
-    quantity = "peak to peak of y over the last 300 of 1,200 samples, Kp = 2.2, constant set "
-    quantity += "point"
-    yield judge(quantity, np.ptp(paper.output[-300:]), "°C", at_least=2 * 0.05 * 5.0)
-    gains = np.linspace(0.1, KP, 22)  # the last is the paper's
+    kp, ki = PAPER_PI
+    runs = batch.run_pi(PAPER_PI, SAMPLES, **CONSTANT)
+    quantity = f"peak to peak of y over the last 300 of 1,200 samples, Kp = {kp:g}, constant "
+    quantity += "set point"
+    yield judge(quantity, np.ptp(runs.output[-300:]), "°C", at_least=2 * 0.05 * 5.0)
+
+    lower_gains = [Gains(float(lower), ki) for lower in np.linspace(0.1, kp, 22)]
     cases = {"constant set point": CONSTANT, "square wave": SQUARE, NOISY_SQUARE: NOISY}
-    for name, arguments in cases.items():
-        errors = [mean_error(batch.run_pi(kp, KI, 1200, **arguments)) for kp in gains]
+    for title, arguments in cases.items():
+        errors = [
+            mean_error(batch.run_pi(gains, SAMPLES, **arguments)) for gains in lower_gains
+        ]
         medians = [float(np.median(error)) for error in errors]
-        best = int(np.argmin(medians[:-1]))
-        quantity = f"mean error with the best lower Kp ({gains[best]:.1f}) as a multiple of "
-        quantity += f"that with {KP:g}, {name}"
-        # Of one run without noise, an exact number.
+        best = int(np.argmin(medians[:-1]))  # the last is the paper's
+        quantity = f"mean error with the best lower Kp ({lower_gains[best].kp:.1f}) as a "
+        quantity += f"multiple of that with {kp:g}, {title}"
+        # Without noise there is one run, and this is an exact number.
         yield judge(quantity, (errors[best] / errors[-1]).squeeze(), at_least=1 - NOTABLE)
-    doubled = batch.run_pi(2 * KP, KI, 1200, **CONSTANT)
-    limited = 100 * np.mean(np.abs(doubled.applied[-300:]) == Parameters().u_max)
-    quantity = f"samples of the last 300 with the flow at a limit, Kp = {2 * KP:g}"
-    yield judge(quantity, limited, "%", at_least=50)
-    quantity = f"largest pole without dead zone and limits, Kp = {2 * KP:g}: unstable above 1"
-    yield judge(quantity, largest_pole(2 * KP, KI), at_least=1)
-    yield judge("the same, Kp = 2.2", largest_pole(KP, KI))
-    smallest = min(largest_pole(gain, KI) for gain in gains)
-    yield judge("the same, the best Kp of 0.1 to 2.2", smallest)
 
-
-def largest_pole(kp: float, ki: float) -> float:
-    """Return the modulus of the largest pole of the loop of a PI and the plant (28).
-
-    The actuator is left out. The loop is stable if this is below 1.
-    """
-    up, down = PIController(kp, ki).transfer()
-    plant = linear.nominal(Parameters())
-    a, b = [1.0, *-plant.alpha], [*np.zeros(18 + 1), *plant.beta]  # the delay, and one
-    closed: Array = polyadd(np.convolve(down, a), np.convolve(up, b))
-    return float(np.abs(np.roots(closed)).max())
+    doubled_gains = Gains(2 * kp, ki)
+    runs = batch.run_pi(doubled_gains, SAMPLES, **CONSTANT)
+    limited_share = 100 * np.mean(np.abs(runs.applied[-300:]) == Parameters().u_max)
+    quantity = f"samples of the last 300 with the flow at a limit, Kp = {2 * kp:g}"
+    yield judge(quantity, limited_share, "%", at_least=50)
+    quantity = f"largest pole without dead zone and limits, Kp = {2 * kp:g}: unstable above 1"
+    yield judge(quantity, largest_pole(doubled_gains), at_least=1)
+    quantity = "largest pole without dead zone and limits"
+    yield judge(f"{quantity}, Kp = {kp:g}", largest_pole(PAPER_PI))
+    smallest = min(largest_pole(gains) for gains in lower_gains)
+    yield judge(f"{quantity}, the best Kp of 0.1 to {kp:g}", smallest)
 
 
 @claimed(
     "Section 5, end of the comparison",
     "No PI controller can perform well here: the NN is much better than one with searched "
     "gains, too",
-    f"Kp = {SEARCHED_PI[0]:g}, Ki = {SEARCHED_PI[1]:g}, searched with the same budget as the "
+    f"Kp = {SEARCHED_PI.kp:g}, Ki = {SEARCHED_PI.ki:g}, searched with the same budget as the "
     "network's gains. Otherwise as above.",
     name="nn-against-searched-pi",
     gains=SEARCHED_PI,
@@ -214,24 +204,25 @@ def largest_pole(kp: float, ki: float) -> float:
 @claimed(
     "Section 5, Figs 5 and 10, 8 and 11",
     "The NN is much better than the PI controller with the paper's gains",
-    f"Kp = {KP:g}, Ki = {KI:g}. Much better: the mean error is smaller by a fifth or more, in "
-    "the same noise.",
+    f"Kp = {PAPER_PI.kp:g}, Ki = {PAPER_PI.ki:g}. Much better: the mean error is smaller by a "
+    "fifth or more, in the same noise.",
     name="nn-against-paper-pi",
     gains=PAPER_PI,
 )
-def versus_pi(batch: Batch, gains: tuple[float, float]) -> Findings:
-    for noise_name, noise_arguments in (("", {}), (", R = 0.5 °C²", NOISY)):
-        for name, setpoint, samples in SETPOINTS:
-            arguments = {**setpoint, **noise_arguments}
-            nn = mean_error(batch.run_nn(samples, **arguments))
-            pi = mean_error(batch.run_pi(*gains, samples, **arguments))
-            case = f"{name}{noise_name}"
+def versus_pi(batch: Batch, gains: Gains) -> Findings:
+    for noise_title, noise_arguments in (("", {}), (", R = 0.5 °C²", NOISY)):
+        for setpoint in SETPOINTS:
+            arguments = {**setpoint.arguments, **noise_arguments}
+            nn_errors = mean_error(batch.run_nn(setpoint.samples, **arguments))
+            pi_errors = mean_error(batch.run_pi(gains, setpoint.samples, **arguments))
+            case = f"{setpoint.title}{noise_title}"
             quantity = f"mean error of the NN as a multiple of the PI's, {case}"
-            yield judge(quantity, nn / pi, at_most=1 - MUCH)
-            yield judge_share(f"the NN is better, {case}", nn < pi)
-    nn = mean_error(batch.run_nn(1200, dead_zone=7.0))
-    pi = mean_error(batch.run_pi(*gains, 1200, dead_zone=7.0))
-    yield judge("the same ratio, square wave, dead zone 7 t/h", nn / pi)
+            yield judge(quantity, nn_errors / pi_errors, at_most=1 - MUCH)
+            yield judge_share(f"the NN is better, {case}", nn_errors < pi_errors)
+    nn_errors = mean_error(batch.run_nn(SAMPLES, dead_zone=7.0))
+    pi_errors = mean_error(batch.run_pi(gains, SAMPLES, dead_zone=7.0))
+    quantity = "mean error of the NN as a multiple of the PI's, square wave, dead zone 7 t/h"
+    yield judge(quantity, nn_errors / pi_errors)
 
 
 @claimed(
@@ -242,16 +233,15 @@ def versus_pi(batch: Batch, gains: tuple[float, float]) -> Findings:
 def direction(batch: Batch) -> Findings:
     runs = batch.run(batch.networks(direction=1), 600, **CONSTANT)
     reachable = abs(linear.nominal(Parameters()).gain) * 10.0  # degC
-    beyond = np.abs(runs.output) > 0.9 * reachable
-    when = np.where(beyond.any(axis=0), np.argmax(beyond, axis=0), np.inf)
-    soon = (
-        f"y beyond 90 % of the largest deviation that the flow can cause, within {SOON} samples"
-    )
-    yield judge_share(soon, when <= SOON, often=True)
-    late = "the same when the run ends, after 600 samples"
-    yield judge_share(late, beyond[-1], often=True)
-    yield judge_share("the same, on the wrong side", runs.output[-1] < 0)
-    yield from judge_time("time until y is beyond it", when)
+    is_beyond = np.abs(runs.output) > 0.9 * reachable
+    times = np.where(is_beyond.any(axis=0), np.argmax(is_beyond, axis=0), np.inf)
+    quantity = "temperature exceeds 90 % of the largest deviation that the flow can cause, in "
+    quantity += f"either direction, within {SOON} samples"
+    yield judge_share(quantity, times <= SOON, often=True)
+    quantity = "temperature exceeds it when the run ends, after 600 samples"
+    yield judge_share(quantity, is_beyond[-1], often=True)
+    yield judge_share("temperature is on the wrong side when the run ends", runs.output[-1] < 0)
+    yield from judge_time("time until the temperature exceeds it", times)
 
 
 @claimed(
@@ -272,16 +262,17 @@ def direction(batch: Batch) -> Findings:
     shapes={"6 hidden nodes": {"nodes": 6}},
 )
 def against_the_paper(batch: Batch, shapes: Mapping[str, Mapping[str, int]]) -> Findings:
-    for case, arguments, samples in (*SETPOINTS, (NOISY_SQUARE, NOISY, 1200)):
-        paper = mean_error(batch.run_nn(samples, **arguments))
-        for (name, shape), slower in itertools.product(shapes.items(), (False, True)):
-            n = shape.get("length", 3)
-            windows: dict[str, Any] = {"setpoint_window": n, "error_window": n}
+    noisy_square = Scenario("noisy-square", NOISY_SQUARE, SAMPLES, NOISY)
+    for case in (*SETPOINTS, noisy_square):
+        paper_errors = mean_error(batch.run_nn(case.samples, **case.arguments))
+        for (shape_title, shape), slower in itertools.product(shapes.items(), (False, True)):
+            length = shape.get("length", 3)
+            windows: Arguments = {"setpoint_window": length, "error_window": length}
             networks = batch.networks(**shape, slower=slower)
-            runs = batch.run(networks, samples, **arguments, **windows)
-            quantity = f"mean error with {name}, {GAINS[slower]}, as a multiple of that of the "
-            quantity += f"paper's network, {case}"
-            yield judge(quantity, mean_error(runs) / paper, at_least=1 - NOTABLE)
+            runs = batch.run(networks, case.samples, **case.arguments, **windows)
+            quantity = f"mean error with {shape_title}, {GAINS[slower]}, as a multiple of that "
+            quantity += f"of the paper's network, {case.title}"
+            yield judge(quantity, mean_error(runs) / paper_errors, at_least=1 - NOTABLE)
 
 
 @claimed(
@@ -293,29 +284,34 @@ def against_the_paper(batch: Batch, shapes: Mapping[str, Mapping[str, int]]) -> 
 )
 def reliability(batch: Batch) -> Findings:
     for slower, stuck_at in itertools.product((False, True), (0, 1)):
-        error = {}
+        errors = {}
         for nodes in (3, 6, 12):
             networks = batch.networks(nodes=nodes, slower=slower)
-
-            def damage(k: int) -> None:
-                if k == LEARNING:
-                    weights = networks.weights
-                    weights.W[..., 0, :] = 0.0
-                    # So far out on the sigmoid the slope vanishes: the node cannot learn.
-                    weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
-                    networks.weights = weights
-
+            damage = partial(damage_networks, networks, stuck_at)
             runs = batch.run(networks, 2 * LEARNING, damage, **CONSTANT)
-            before, after = runs[:LEARNING], runs[LEARNING:]
-            error[nodes] = mean_error(after)
+            runs_before = runs[:LEARNING]
+            runs_after = runs[LEARNING:]
+            errors[nodes] = mean_error(runs_after)
             case = f"{nodes} nodes, one stuck at {stuck_at}, {GAINS[slower]}"
             if stuck_at == 0:
-                yield judge_share(f"settled before the failure, {case}", settled(before))
-            yield judge_share(f"settled 600 samples after the failure, {case}", settled(after))
-            yield judge(f"mean error in these samples, {case}", error[nodes], "°C")
+                yield judge_share(f"settled before the failure, {case}", settled(runs_before))
+            quantity = f"settled 600 samples after the failure, {case}"
+            yield judge_share(quantity, settled(runs_after))
+            quantity = f"mean error in the 600 samples after the failure, {case}"
+            yield judge(quantity, errors[nodes], "°C")
             if nodes > 3:
-                quantity = f"the same as a multiple of that with 3 nodes, {case}"
-                yield judge(quantity, error[nodes] / error[3], at_most=1 - NOTABLE)
+                quantity = f"this error as a multiple of that with 3 nodes, {case}"
+                yield judge(quantity, errors[nodes] / errors[3], at_most=1 - NOTABLE)
+
+
+def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None:
+    """At k = `LEARNING`, let the output of a hidden node of every network stay at 0 or at 1."""
+    if k == LEARNING:
+        weights = networks.weights
+        weights.W[..., 0, :] = 0.0
+        # So far out on the sigmoid the slope vanishes: the node cannot learn.
+        weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
+        networks.weights = weights
 
 
 @claimed(
@@ -325,10 +321,10 @@ def reliability(batch: Batch) -> Findings:
     "plant changes, and for 1,200 more, from rest, the weights learn on or stay as they are.",
 )
 def keep_learning(batch: Batch) -> Findings:
-    network = batch.networks()
-    batch.run(network, 1200, **SQUARE)
-    learnt = network.weights
-    for name, plant in (
+    networks = batch.networks()
+    batch.run(networks, SAMPLES, **SQUARE)
+    learnt_weights = networks.weights
+    for title, plant in (
         ("gain times 0.75", {"gain_factor": 0.75}),
         ("gain times 1.25", {"gain_factor": 1.25}),
         ("gain times 1.4", {"gain_factor": 1.4}),
@@ -336,18 +332,18 @@ def keep_learning(batch: Batch) -> Findings:
         ("gain times 1.25 and delay 27", {"gain_factor": 1.25, "delay": 27}),
         ("no change", {}),
     ):
-        error = {}
+        errors = {}
         for learning in (True, False):
-            network.weights = learnt
-            network.learning = learning
-            error[learning] = mean_error(batch.run(network, 1200, **SQUARE, **plant))
+            networks.weights = learnt_weights
+            networks.learning = learning
+            errors[learning] = mean_error(batch.run(networks, SAMPLES, **SQUARE, **plant))
         quantity = "mean error of learning weights as a multiple of that of frozen ones, "
-        quantity += name
+        quantity += title
         at_most = 1 - NOTABLE if plant else math.inf
-        yield judge(quantity, error[True] / error[False], at_most=at_most)
-        yield judge(f"mean error of frozen weights, {name}", error[False], "°C")
-        useless = error[False] >= 5.0
-        yield judge_share(f"frozen weights do no better than no control, {name}", useless)
+        yield judge(quantity, errors[True] / errors[False], at_most=at_most)
+        yield judge(f"mean error of frozen weights, {title}", errors[False], "°C")
+        is_useless = errors[False] >= 5.0
+        yield judge_share(f"frozen weights do no better than no control, {title}", is_useless)
 
 
 @claimed(
@@ -359,38 +355,36 @@ def keep_learning(batch: Batch) -> Findings:
 def direction_only(batch: Batch) -> Findings:
     # The flow that a set point needs depends on the gain. For 5 degC it lies beyond the limits
     # if the gain is below 0.74, and inside the dead zone if it is above 1.46.
-    five, scaled = "set point 5 °C", "set point 5 °C times the gain"
-    plants = {}
-    for family, gains in ((five, (0.75, 1.0, 1.25, 1.4)), (scaled, (0.7, 1.0, 1.25, 1.5))):
+    five = "set point 5 °C"
+    scaled = "set point 5 °C times the gain"
+    plants_by_setpoint: dict[str, pd.DataFrame] = {}
+    for setpoint_title, gains in (
+        (five, (0.75, 1.0, 1.25, 1.4)),
+        (scaled, (0.7, 1.0, 1.25, 1.5)),
+    ):
         rows = []
         for constant, gain, delay in itertools.product((0.5, 1.0, 2.0), gains, (9, 18, 27, 36)):
             plant = {"gain_factor": gain, "time_constant_factor": constant, "delay": delay}
-            setpoint = 5.0 * gain if family == scaled else 5.0
-            runs = settled(batch.run_nn(1200, setpoint=setpoint, **plant))
-            rows.append((constant, gain, delay, runs, runs.mean()))
-        columns = ["constant", "gain", "delay", "runs", "share"]
-        plants[family] = pd.DataFrame(rows, columns=columns)
+            setpoint = 5.0 * gain if setpoint_title == scaled else 5.0
+            has_settled = settled(batch.run_nn(SAMPLES, setpoint=setpoint, **plant))
+            row = {"constant": constant, "gain": gain, "delay": delay}
+            rows.append({**row, "runs": has_settled, "share": has_settled.mean()})
+        plants_by_setpoint[setpoint_title] = pd.DataFrame(rows)
 
-    def worst(text: str, family: str, which: str = "delay > 0") -> Finding:
-        found = plants[family].query(which)
-        row = found.iloc[found["share"].argmin()]
-        where = f"delay {row['delay']}, gain {row['gain']:g}"
-        where += f", time constant {row['constant']:g}"
-        quantity = f"settled within 1,200 samples, the worst of {text}, {family} ({where})"
-        return judge_share(quantity, row["runs"], often=True)
-
-    yield worst("delays from 9 to 36", five, "constant == 1 and gain == 1")
-    constants = "time constants from 0.5 to 2 times the paper's"
-    yield worst(constants, five, "gain == 1 and delay == 18")
-    for family, found in plants.items():
-        text = (
-            f"gains from {found['gain'].min():g} to {found['gain'].max():g} times the paper's"
-        )
-        yield worst(text, family, "constant == 1 and delay == 18")
-    for family, found in plants.items():
-        yield worst(f"all {len(found)} combinations", family)
-        quantity = f"combinations in which at least {OFTEN:.0%} of runs settle, {family}"
-        yield judge(quantity, 100 * (found["share"] >= OFTEN).mean(), "%")
+    plants = plants_by_setpoint[five]
+    delays = plants.query("constant == 1 and gain == 1")
+    yield judge_worst(delays, f"delays from 9 to 36, {five}")
+    constants = plants.query("gain == 1 and delay == 18")
+    yield judge_worst(constants, f"time constants from 0.5 to 2 times the paper's, {five}")
+    for setpoint_title, plants in plants_by_setpoint.items():
+        lowest, highest = plants["gain"].min(), plants["gain"].max()
+        text = f"gains from {lowest:g} to {highest:g} times the paper's, {setpoint_title}"
+        yield judge_worst(plants.query("constant == 1 and delay == 18"), text)
+    for setpoint_title, plants in plants_by_setpoint.items():
+        yield judge_worst(plants, f"all {len(plants)} combinations, {setpoint_title}")
+        quantity = f"combinations in which at least {OFTEN:.0%} of runs settle, "
+        quantity += setpoint_title
+        yield judge(quantity, 100 * (plants["share"] >= OFTEN).mean(), "%")
 
 
 @claimed(

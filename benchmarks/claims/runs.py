@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, isinf
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -20,10 +20,18 @@ Finding = dict[str, Any]  # a row of the table of numbers
 NOTE = (
     "Each case is run with independent initial weights and noise. A mean error is that of one "
     "run over its samples; the number in the table, like a ratio of such errors, is the median "
-    "over the runs. A criterion counts as shown only if the entire 95 % confidence interval "
-    "satisfies it. A claim holds if all its criteria are shown, and in part if some are."
+    "over the runs. A criterion counts as met only if the entire 95 % confidence interval "
+    "satisfies it. A claim holds if all its criteria are met, and it holds in part if some of "
+    "them are."
 )
 OFTEN = 0.9  # "works", "converges": in at least this share of the draws
+
+
+class Gains(NamedTuple):
+    """The gains of a PI controller."""
+
+    kp: float
+    ki: float
 
 
 @dataclass(frozen=True)
@@ -42,14 +50,18 @@ class Batch:
         faster the more terms it has, if the weights of all terms learn with the same gain;
         `slower` scales the gains down to compensate.
         """
-        of_nodes, of_inputs = (3 / nodes, 3 / length) if slower else (1.0, 1.0)
+        node_scale = 1.0
+        input_scale = 1.0
+        if slower:
+            node_scale = 3 / nodes
+            input_scale = 3 / length
         paper = DirectNNController()
         return DirectNNController(
             n_inputs=2 * length,
             n_hidden=nodes,
-            eta=of_nodes * of_inputs * paper.eta,
-            eta_1=of_nodes * paper.eta_1,
-            eta_theta=of_nodes * paper.eta_theta,
+            eta=node_scale * input_scale * paper.eta,
+            eta_1=node_scale * paper.eta_1,
+            eta_theta=node_scale * paper.eta_theta,
             direction=direction,
             error_index=length,
             seed=self.seed,
@@ -67,82 +79,145 @@ class Batch:
         """Run the paper's networks."""
         return self.run(self.networks(), samples, **arguments)
 
-    def run_pi(self, kp: float, ki: float, samples: int, **arguments: Any) -> Trajectory:
+    def run_pi(self, gains: Gains, samples: int, **arguments: Any) -> Trajectory:
         """Run a PI controller, only once if there is no noise."""
         batch = self if "noise_variance" in arguments else Batch(1, self.seed)
-        return batch.run(PIController(kp, ki), samples, **arguments)
+        return batch.run(PIController(*gains), samples, **arguments)
 
 
 def judge(
-    quantity: str, found: Any, unit: str = "", *, at_least: float = -inf, at_most: float = inf
+    quantity: str, value: Any, unit: str = "", *, at_least: float = -inf, at_most: float = inf
 ) -> Finding:
-    """Judge a number: an estimate, the median of one value per run, or an exact value.
+    """Return a finding: a number, and whether it meets a criterion.
 
-    A bound makes the number part of the verdict. It is shown if the whole interval keeps the
-    bound, and not shown if no part of the interval does.
+    Parameters
+    ----------
+    quantity
+        What the number is, in words.
+    value
+        An `Estimate`; an array with a value for each run, of which the median is estimated; or
+        an exact number.
+    unit
+        Unit of the number.
+    at_least, at_most
+        Bounds that a claim asks for. They are shown to hold if the entire interval satisfies
+        them, and shown not to hold if no part of it does. Without a bound, the number is
+        information, and no part of the verdict.
     """
-    if not isinstance(found, Estimate):
-        one = float(np.ravel(found)[0])
-        found = quantile(found, 0.5) if np.ndim(found) else Estimate(one, one, one, 1)
+    estimate = _estimate(value)
     bounds = {"at least": at_least, "at most": at_most}
-    asked = [f"{name} {bound:g}" for name, bound in bounds.items() if isfinite(bound)]
-    shown = "undecided" if asked else ""
-    if asked and at_least <= found.low and found.high <= at_most:
-        shown = "yes"
-    elif found.high < at_least or found.low > at_most:
-        shown = "no"
-    criterion = {"criterion": " and ".join(asked), "shown": shown}
-    return {"quantity": quantity, "unit": unit, **vars(found), **criterion}
+    criteria = [f"{name} {bound:g}" for name, bound in bounds.items() if isfinite(bound)]
+    shown = ""
+    if criteria:
+        shown = _shown(estimate, at_least, at_most)
+    return {
+        "quantity": quantity,
+        "unit": unit,
+        **vars(estimate),
+        "criterion": " and ".join(criteria),
+        "shown": shown,
+    }
 
 
-def judge_share(quantity: str, found: NDArray[np.bool_], *, often: bool = False) -> Finding:
-    """Judge the share of runs in which `found` is true; `often` requires `OFTEN`."""
+def _estimate(value: Any) -> Estimate:
+    """Return an estimate of a number; see `judge`."""
+    if isinstance(value, Estimate):
+        return value
+    if np.ndim(value):
+        return quantile(value, 0.5)
+    number = float(value)
+    return Estimate(number, number, number, 1)
+
+
+def _shown(estimate: Estimate, at_least: float, at_most: float) -> str:
+    """Return whether bounds hold: "yes", "no" or "undecided"."""
+    if at_least <= estimate.low and estimate.high <= at_most:
+        return "yes"
+    if estimate.high < at_least or estimate.low > at_most:
+        return "no"
+    return "undecided"
+
+
+def judge_share(quantity: str, happened: NDArray[np.bool_], *, often: bool = False) -> Finding:
+    """Judge the share of runs in which something happened; `often` requires `OFTEN`."""
     at_least = 100 * OFTEN if often else -inf
-    return judge(quantity, share(found).scaled(100), "% of runs", at_least=at_least)
+    return judge(quantity, share(happened).scaled(100), "% of runs", at_least=at_least)
+
+
+def judge_worst(plants: pd.DataFrame, text: str) -> Finding:
+    """Judge the share of runs that settle on the plant on which it is smallest.
+
+    `plants` has a row for each plant, with the columns `delay`, `gain`, `constant`, `share`,
+    and `runs`: whether each run has settled.
+    """
+    worst = plants.iloc[plants["share"].argmin()]
+    numbers = f"delay {worst['delay']}, gain {worst['gain']:g}"
+    numbers += f", time constant {worst['constant']:g}"
+    quantity = f"settled within 1,200 samples, the worst of {text} ({numbers})"
+    return judge_share(quantity, worst["runs"], often=True)
 
 
 def judge_time(quantity: str, samples: ArrayLike) -> Iterator[Finding]:
-    """Find the 10th, 50th and 90th percentiles of a time; infinite means never."""
-    for p in (0.1, 0.5, 0.9):
-        yield judge(f"{quantity}, {p:.0%} of runs", quantile(samples, p), "samples")
+    """Yield the 10th, 50th and 90th percentile of a time in samples; infinite means never."""
+    for probability in (0.1, 0.5, 0.9):
+        estimate = quantile(samples, probability)
+        yield judge(f"{quantity}, {probability:.0%} of runs", estimate, "samples")
 
 
 def verdict(findings: Iterable[Finding]) -> str:
     """Return the verdict in words; an undecided finding counts as not shown."""
-    shown = [row["shown"] == "yes" for row in findings if row["shown"]]
-    if not shown:
+    met = [finding["shown"] == "yes" for finding in findings if finding["shown"]]
+    if not met:
         return "cannot be tested from the text"
-    if all(shown):
+    if all(met):
         return "holds"
-    return "holds in part" if any(shown) else "does not hold"
+    if any(met):
+        return "holds in part"
+    return "does not hold"
 
 
-def table(claims: Mapping[str, Any], found: Mapping[str, Sequence[Finding]]) -> pd.DataFrame:
-    """Return one row for each finding about a claim, and one for a claim without findings."""
-    rows = []
-    for name, findings in found.items():
-        claim, judged = claims[name], verdict(findings)
-        about = {"claim": name, "section": claim.section, "statement": claim.statement}
-        rows += [{**about, "verdict": judged, **each} for each in findings or [{"runs": None}]]
+def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) -> pd.DataFrame:
+    """Return one row for each finding about a claim, and one for a claim without findings.
+
+    Both arguments are by the names of the claims.
+    """
+    rows: list[dict[str, Any]] = []
+    for name, findings_of_claim in findings.items():
+        claim_columns = {
+            "claim": name,
+            "section": claims[name].section,
+            "statement": claims[name].statement,
+            "verdict": verdict(findings_of_claim),
+        }
+        rows += [{**claim_columns, **finding} for finding in findings_of_claim]
+        if not findings_of_claim:
+            rows.append({**claim_columns, "runs": None})
     # Nullable integers, as a claim without findings has no runs.
     return pd.DataFrame(rows).astype({"runs": "Int64"})
 
 
 def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
-    """Return the sections of the report: the verdicts, then the numbers of each claim."""
+    """Return the sections of the report: the verdicts, then the numbers of each claim.
+
+    `numbers` are those of `table`.
+    """
     verdicts = numbers.drop_duplicates("claim")[["statement", "verdict"]]
-    found = [Section("", [NOTE], verdicts.rename(columns={"statement": "claim"}))]
+    report = [Section("", [NOTE], verdicts.rename(columns={"statement": "claim"}))]
     for name, rows in numbers.groupby("claim", sort=False):
-        claim, measured = claims[str(name)], rows.dropna(subset="runs")
+        claim = claims[str(name)]
+        measured = rows.dropna(subset="runs")
         title = f"{claim.statement}: {rows['verdict'].iloc[0]}"
-        shown = _formatted(measured) if len(measured) else None
+        formatted = _formatted(measured) if len(measured) else None
         text = f"{claim.section}. {claim.method}"
-        found.append(Section(title, [text], shown, bold=["no"]))
-    return found
+        report.append(Section(title, [text], formatted, bold=["no"]))
+    return report
 
 
 def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
-    value, low, high = (rows[name].map(_three_digits) for name in ("value", "low", "high"))
+    """Return the rows of `table` as a report shows them."""
+    value = rows["value"].map(_three_digits)
+    low = rows["low"].map(_three_digits)
+    high = rows["high"].map(_three_digits)
     columns = {
         "measured": rows["quantity"] + rows["unit"].map(lambda unit: unit and f" ({unit})"),
         "value": value,
@@ -154,7 +229,11 @@ def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _three_digits(value: float) -> str:
+    """Return a number with about three digits; an infinite time is "never"."""
     if isinf(value):
         return "never" if value > 0 else "?"
-    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 3
-    return f"{value:,.{digits}f}"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    if abs(value) >= 10:
+        return f"{value:.1f}"
+    return f"{value:.3f}"

@@ -34,7 +34,7 @@ from mptc_gym.evaluation import SEED
 _CASES = (
     f"Cases to run (default: all). Of the paper: {', '.join(SCENARIOS)}. With --presets: "
     f"{', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set: "
-    f"{', '.join(name for name, *_ in SETPOINTS)}."
+    f"{', '.join(setpoint.name for setpoint in SETPOINTS)}."
 )
 
 _OUT = "Folder (default: results/compare; compare-presets or compare-plant for other cases)."

@@ -14,7 +14,7 @@ RESAMPLES = 2000  # bootstrap resamples
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its confidence interval, estimated from `runs` runs."""
+    """A value with its 95 % confidence interval from `low` to `high`, from `runs` runs."""
 
     value: float
     low: float
@@ -26,17 +26,23 @@ class Estimate:
         return Estimate(factor * self.value, factor * self.low, factor * self.high, self.runs)
 
     def __format__(self, form: str) -> str:
-        """Return `value (low to high)`; the value alone if nothing was random."""
-        value, low, high = (written(end, form) for end in (self.value, self.low, self.high))
+        """Return "value (low to high)"; the value alone if nothing was random."""
+        value = written(self.value, form)
+        low = written(self.low, form)
+        high = written(self.high, form)
         if math.isinf(self.high):
             return f"{value} (one run)"
-        return value if low == high else f"{value} ({low} to {high})"
+        if low == high:
+            return value
+        return f"{value} ({low} to {high})"
 
 
 def written(value: float, form: str) -> str:
-    """Return a number as text, but never -0."""
+    """Return a number as text in a format, but never -0."""
     text = format(value, form)
-    return text.lstrip("-") if set(text) <= set("-0.") else text
+    if set(text) <= set("-0."):
+        return text.lstrip("-")
+    return text
 
 
 def student(values: ArrayLike) -> Estimate:
@@ -45,32 +51,38 @@ def student(values: ArrayLike) -> Estimate:
     A single run, or equal values, give an interval of zero width.
     """
     numbers = np.asarray(values, dtype=np.float64)
-    mean, runs = float(numbers.mean()), len(numbers)
+    mean = float(numbers.mean())
+    runs = len(numbers)
     if runs < 2 or np.ptp(numbers) == 0.0:
         return Estimate(mean, mean, mean, runs)
-    error = float(numbers.std(ddof=1)) / math.sqrt(runs)
-    # That of scipy.stats.t, which takes long to import.
-    half = float(scipy.special.stdtrit(runs - 1, ENDS[1])) * error
-    return Estimate(mean, mean - half, mean + half, runs)
+    standard_error = float(numbers.std(ddof=1)) / math.sqrt(runs)
+    # The quantile of scipy.stats.t, which takes long to import.
+    half_width = float(scipy.special.stdtrit(runs - 1, ENDS[1])) * standard_error
+    return Estimate(mean, mean - half_width, mean + half_width, runs)
 
 
 def quantile(values: ArrayLike, probability: float) -> Estimate:
     """Estimate a quantile over runs, shape (runs,).
 
-    The interval, that of `scipy.stats.quantile_test`, lies between two of the ordered values.
-    It assumes nothing about their distribution, and is infinite where there are too few runs.
+    The interval of `scipy.stats.quantile_test` is used. Its ends are two of the ordered values,
+    or infinite if there are too few runs. It assumes nothing about their distribution.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
-    interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval()
-    low = -np.inf if np.isnan(interval.low) else interval.low
-    high = np.inf if np.isnan(interval.high) else interval.high
     value = percentiles(ordered, value=100.0 * probability)["value"]
-    return Estimate(float(value), float(low), float(high), len(ordered))
+    interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval()
+    low = float(interval.low)
+    if math.isnan(low):
+        low = -math.inf
+    high = float(interval.high)
+    if math.isnan(high):
+        high = math.inf
+    return Estimate(float(value), low, high, len(ordered))
 
 
 def share(happened: NDArray[np.bool_]) -> Estimate:
-    """Estimate the share of runs in which something happens, with Wilson's interval."""
-    count, runs = int(happened.sum()), len(happened)
+    """Estimate the share of runs in which something happened, with Wilson's interval."""
+    count = int(happened.sum())
+    runs = len(happened)
     interval = scipy.stats.binomtest(count, runs).proportion_ci(method="wilson")
     return Estimate(count / runs, float(interval.low), float(interval.high), runs)
 
@@ -85,28 +97,34 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
     differ far more than runs do, its coverage is 82 %.
     """
     tables = [np.atleast_2d(np.asarray(task, dtype=np.float64)) for task in tasks]
-    together = np.concatenate([table.ravel() for table in tables])
-    value = float(together.mean())
+    all_values = np.concatenate([table.ravel() for table in tables])
+    mean = float(all_values.mean())
     if all(np.ptp(table) == 0.0 for table in tables):  # nothing was random
-        return Estimate(value, value, value, together.size)
+        return Estimate(mean, mean, mean, all_values.size)
     generator = np.random.default_rng(seed)
     members, runs = tables[0].shape
-    samples = []
+    resamples = []
     for table in tables:
-        member = generator.integers(members, size=(RESAMPLES, members, 1))
-        run = generator.integers(runs, size=(RESAMPLES, 1, runs))
-        samples.append(table[member, run].reshape(RESAMPLES, -1))
-    low, high = np.quantile(np.hstack(samples).mean(axis=-1), ENDS)
-    return Estimate(value, float(low), float(high), together.size)
+        member_indices = generator.integers(members, size=(RESAMPLES, members, 1))
+        run_indices = generator.integers(runs, size=(RESAMPLES, 1, runs))
+        resamples.append(table[member_indices, run_indices].reshape(RESAMPLES, -1))
+    low, high = np.quantile(np.hstack(resamples).mean(axis=-1), ENDS)
+    return Estimate(mean, float(low), float(high), all_values.size)
 
 
 def percentiles(
-    values: NDArray[np.float64], method: Any = "linear", **named: float
+    values: NDArray[np.float64], method: Any = "linear", **percents: float
 ) -> dict[str, Any]:
-    """Return percentiles along the last axis, by default the median, the 10th and the 90th.
+    """Return percentiles along the last axis, by the names that they are given.
 
-    Infinite values ("not settled") cannot be interpolated: the next higher value is used.
+    By default they are `median`, `p10` and `p90`. `method` is that of `numpy.percentile`, for
+    finite values. Infinite values, such as the time of a run that never settles, cannot be
+    interpolated: then the next higher value is used.
     """
-    method = method if np.isfinite(values).all() else "higher"
-    named = named or {"median": 50, "p10": 10, "p90": 90}
-    return {n: np.percentile(values, at, axis=-1, method=method) for n, at in named.items()}
+    if not np.isfinite(values).all():
+        method = "higher"
+    percents = percents or {"median": 50, "p10": 10, "p90": 90}
+    return {
+        name: np.percentile(values, percent, axis=-1, method=method)
+        for name, percent in percents.items()
+    }

@@ -48,8 +48,8 @@ class LinearModel:
         shape = np.broadcast_shapes(np.shape(gain), np.shape(time_constant))
         self.parameters, self.numbers = parameters, numbers
         self.alpha = np.empty((*shape, len(alpha)))
-        for i, each in enumerate(alpha):
-            self.alpha[..., i] = each
+        for i, coefficient in enumerate(alpha):
+            self.alpha[..., i] = coefficient
         self.beta: Array = np.broadcast_to(scale, shape)[..., np.newaxis] * np.array(
             parameters.b
         )

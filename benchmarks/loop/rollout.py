@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.acting import rollout as run_batch
+from mptc_gym.draws import Ranges
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import action_from_command, least_effective
-from mptc_gym.signals import Ranges
 
 Array = NDArray[np.float64]
 
 SETTLING_BAND = 0.05  # fraction of the set-point change, or of the set point
-START = 300  # samples of the start of a run
-CHANGE = 60  # samples that a change of the set point counts
+START = 300  # samples that count as the start of a run
+CHANGE = 60  # samples that count as a response to a change of the set point
 LAST = 50  # samples at the end of a run that decide whether it has settled
 
 
@@ -36,7 +36,10 @@ class Agent(Protocol):
 
 
 class IdleValve:
-    """No control: leave the valve at 0 t/h, with limits for all runs or of shape (runs,)."""
+    """No control: the valve stays at 0 t/h.
+
+    The limits are those of the actuator, t/h, for all runs or of shape (runs,).
+    """
 
     def __init__(self, u_min: Any = -10.0, u_max: Any = 10.0) -> None:
         self.action = np.reshape(action_from_command(0.0, u_min, u_max), (-1, 1))
@@ -74,21 +77,27 @@ def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vect
 
 def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[Array]:
     """Return the plant numbers that the environment draws for each run, shape (runs,)."""
-    numbers = Ranges(parameters).given.chosen(tuple(PLANT_NUMBERS))
+    numbers = Ranges(parameters).lowest.chosen(PLANT_NUMBERS)
     if parameters.ranges:
         _, info = make_plants(runs, 1, **asdict(parameters)).reset(seed=seed)
-        numbers |= {name: info[name] for name in parameters.ranges}
+        for name in parameters.ranges:
+            numbers[name] = info[name]
     return PlantNumbers(
-        **{name: np.broadcast_to(value, runs).copy() for name, value in numbers.items()}
+        **{name: np.broadcast_to(values, runs).copy() for name, values in numbers.items()}
     )
 
 
 def is_random(parameters: Parameters) -> bool:
     """Return whether anything is drawn for an episode, even if only its noise."""
-    noises = "noise_variance", "measurement_noise_variance"
-    noisy = any(parameters.range_of(name)[1] > 0.0 for name in noises)
-    drawn = noisy or parameters.is_disturbed or parameters.setpoint == "random"
-    return drawn or bool(parameters.ranges)
+    _, largest_noise = parameters.range_of("noise_variance")
+    _, largest_measurement_noise = parameters.range_of("measurement_noise_variance")
+    return (
+        largest_noise > 0.0
+        or largest_measurement_noise > 0.0
+        or parameters.is_disturbed
+        or parameters.setpoint == "random"
+        or bool(parameters.ranges)
+    )
 
 
 def rollout(
@@ -100,89 +109,145 @@ def rollout(
 ) -> Trajectory:
     """Run a controller on a batch of plants for k = 0 to samples - 1. Both are reset first.
 
-    Plants are a vector environment, or given ones as `mptc_gym.acting` opens them. Run i
-    has the noise and the set point of seed `seed + i`. `before` is called with k before
-    the controller acts at sample k, to observe or to damage it.
+    Parameters
+    ----------
+    plants
+        A vector environment, or environments as `mptc_gym.acting` opens them.
+    agent
+        The controller.
+    samples
+        Length of the runs.
+    seed
+        Run i has the noise and the set point of seed `seed + i`.
+    before
+        Called with k before the controller acts at sample k, to observe or to damage it.
     """
     seeds = [*range(seed, seed + plants.num_envs)]
     agent.reset()
     act = partial(_watched, before, itertools.count(), agent.act) if before else agent.act
     signals, steps = [], run_batch(plants, act, samples, seeds)
-    for (at, _), (after, _) in itertools.pairwise(steps):
-        # A step reports the command and the applied flow of the sample that it starts at.
-        here = at["setpoint"], at["output"], after["command"], after["applied"]
-        signals.append(np.array([*here, after["error"], after["setpoint"]]))
+    for (info, _), (next_info, _) in itertools.pairwise(steps):
+        # A step reports the command and the applied flow of the sample at which it starts.
+        sample = [
+            info["setpoint"],
+            info["output"],
+            next_info["command"],
+            next_info["applied"],
+            next_info["error"],
+            next_info["setpoint"],
+        ]
+        signals.append(np.array(sample))
     return Trajectory(*np.stack(signals, axis=1))
 
 
-def _watched(before: Callable[[int], object], clock: Iterator[int], act: Any, seen: Any) -> Any:
-    """Call `before` with k, and return the actions for observations."""
+def _watched(
+    before: Callable[[int], object], clock: Iterator[int], act: Any, observations: Any
+) -> Any:
+    """Call `before` with the next k of the clock, and return the actions."""
     before(next(clock))
-    return act(seen)
+    return act(observations)
 
 
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
-    """Compute the measures of each run by their names in CSV files, each of shape (runs,).
+    """Return the measures of each run by their names in CSV files, each of shape (runs,).
 
-    - `mae`: mean of |e(k)| over k = 1 to N, the errors in the rewards;
-    - `mae_start`, `mae_changes`, `mae_steady`: what it is the sum of: the samples before
-      `START`, the `CHANGE` samples from a later change of the set point on, with what reaches
-      beyond `START` of an earlier one, and the rest;
-    - `ise`: integral of e^2 over the same samples;
-    - `itae`: integral of t |e|, with t counted from the latest set-point change;
-    - `total_variation`: valve travel, the total variation of the applied flow, from rest at 0;
+    - `mae`: mean of |e(k)| over k = 1 to N, degC;
+    - `mae_start`, `mae_changes`, `mae_steady`: the parts of this mean, whose sum it is: of the
+      samples before `START`, of the later samples that lie less than `CHANGE` after a change of
+      the set point, and of all others;
+    - `ise`: integral of e^2 over k = 1 to N, degC^2 min;
+    - `itae`: integral of t |e|, degC min^2, with t counted from the latest set-point change;
+    - `total_variation`: valve travel, the total variation of the applied flow, from rest at 0,
+      t/h;
     - `overshoot`: excursion of the output beyond the new set point, as a percentage of the
       set-point change; the largest over all changes;
     - `settling_time`: time from a set-point change until the error stays within `SETTLING_BAND`
-      of the change; the longest over all changes, infinite if the output has not settled by the
-      next change or the end of the run;
-    - `dead_zone_share`: share of samples with the command inside the dead zone;
-    - `saturation_share`: share of samples with the command at or beyond a limit.
+      of the change, min; the longest over all changes, infinite if the output has not settled
+      by the next change or the end of the run;
+    - `dead_zone_share`: share of samples with the command inside the dead zone, %;
+    - `saturation_share`: share of samples with the command at or beyond a limit, %.
 
     The last two are NaN if the actuator's numbers are drawn from ranges.
     """
     interval = parameters.sampling_interval / 60.0  # min
-    command, error = trajectory.command, np.abs(trajectory.next_error)
-    inside = saturated = np.full(command.shape, np.nan)
-    if not {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
-        zone, u_min, u_max = parameters.dead_zone, parameters.u_min, parameters.u_max
-        inside = np.abs(command) < least_effective(zone, u_min, u_max)  # as the plant judges it
-        saturated = (command <= u_min) | (command >= u_max)
-    k = np.arange(1, len(error) + 1)[:, np.newaxis]
-    changed = np.diff(trajectory.next_setpoint, axis=0, prepend=trajectory.setpoint[:1]) != 0.0
-    latest = np.maximum.accumulate(np.where(changed, k, -CHANGE), axis=0)
-    start, moved = k < START, k < latest + CHANGE
-    parts = {"start": start, "changes": ~start & moved, "steady": ~start & ~moved}
-    pairs = zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
-    itae, overshoot, settling = np.array([_measure_steps(*each) for each in pairs]).T
+    errors = np.abs(trajectory.next_error)
+    steps = [
+        _measure_steps(setpoint, output)
+        for setpoint, output in zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
+    ]
     moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
     return {
         "mae": mean_error(trajectory),
-        **{f"mae_{name}": (error * part).mean(axis=0) for name, part in parts.items()},
-        "ise": interval * np.square(error).sum(axis=0),
-        "itae": interval**2 * itae,
+        **_parts_of_error(trajectory),
+        "ise": interval * np.square(errors).sum(axis=0),
+        "itae": interval**2 * np.array([step.itae for step in steps]),
         "total_variation": np.abs(moves).sum(axis=0),
-        "overshoot": 100.0 * overshoot,
-        "settling_time": interval * settling,
-        "dead_zone_share": 100.0 * inside.mean(axis=0),
-        "saturation_share": 100.0 * saturated.mean(axis=0),
+        "overshoot": 100.0 * np.array([step.overshoot for step in steps]),
+        "settling_time": interval * np.array([step.settling for step in steps]),
+        **_actuator_shares(trajectory.command, parameters),
     }
 
 
-def _measure_steps(setpoint: Array, output: Array) -> tuple[float, float, float]:
-    """Return one run's ITAE (degC samples^2), overshoot (share), settling time (samples)."""
-    itae, overshoot, settling = 0.0, 0.0, 0.0
-    before = 0.0  # the set point before k = 0
+def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
+    """Return the parts of the mean error by name, degC, each of shape (runs,)."""
+    errors = np.abs(trajectory.next_error)
+    k = np.arange(1, len(errors) + 1)[:, np.newaxis]
+    setpoint_moves = np.diff(trajectory.next_setpoint, axis=0, prepend=trajectory.setpoint[:1])
+    latest_change = np.maximum.accumulate(np.where(setpoint_moves != 0.0, k, -CHANGE), axis=0)
+    is_start = k < START
+    is_change = k < latest_change + CHANGE
+    return {
+        "mae_start": (errors * is_start).mean(axis=0),
+        "mae_changes": (errors * (~is_start & is_change)).mean(axis=0),
+        "mae_steady": (errors * (~is_start & ~is_change)).mean(axis=0),
+    }
+
+
+def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]:
+    """Return the shares of commands in the dead zone and at a limit, %, shape (runs,)."""
+    if {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
+        unknown = np.full(command.shape[1], np.nan)
+        return {"dead_zone_share": unknown, "saturation_share": unknown}
+    u_min = parameters.u_min
+    u_max = parameters.u_max
+    edge = least_effective(parameters.dead_zone, u_min, u_max)  # as the plant judges it
+    is_inside = np.abs(command) < edge
+    is_at_limit = (command <= u_min) | (command >= u_max)
+    return {
+        "dead_zone_share": 100.0 * is_inside.mean(axis=0),
+        "saturation_share": 100.0 * is_at_limit.mean(axis=0),
+    }
+
+
+class _Steps(NamedTuple):
+    """Measures of the responses to the steps of the set point in one run; see `measure`."""
+
+    itae: float  # degC samples^2
+    overshoot: float  # share of the step
+    settling: float  # samples
+
+
+def _measure_steps(setpoint: Array, output: Array) -> _Steps:
+    """Return the measures of one run, given y_d(k) and y(k), degC, shape (N,)."""
+    itae = 0.0
+    overshoot = 0.0
+    settling = 0.0
+    previous_setpoint = 0.0  # before k = 0
     for start, stop in held(setpoint):
-        error = setpoint[start:stop] - output[start:stop]
-        itae += float(np.arange(stop - start) @ np.abs(error))
-        change, before = setpoint[start] - before, setpoint[start]
+        errors = setpoint[start:stop] - output[start:stop]
+        itae += float(np.arange(stop - start) @ np.abs(errors))
+        change = setpoint[start] - previous_setpoint
+        previous_setpoint = setpoint[start]
         if change == 0.0:  # a run that begins at set point 0
             continue
-        overshoot = max(overshoot, float(np.max(-error / change)))
-        last = max(np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(change)), default=-1)
-        settling = max(settling, math.inf if last == stop - start - 1 else float(last + 1))
-    return itae, overshoot, settling
+        overshoot = max(overshoot, float(np.max(-errors / change)))
+        outside = np.flatnonzero(np.abs(errors) > SETTLING_BAND * abs(change))
+        if len(outside) == 0:
+            continue
+        if outside[-1] == stop - start - 1:  # not settled at the end
+            settling = math.inf
+        settling = max(settling, float(outside[-1] + 1))
+    return _Steps(itae, overshoot, settling)
 
 
 def held(setpoint: Array) -> list[tuple[int, int]]:
@@ -198,6 +263,7 @@ def mean_error(trajectory: Trajectory) -> Array:
 
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
     """Return whether the last `LAST` errors of each run are all within `SETTLING_BAND`."""
-    setpoint, output = trajectory.setpoint[-LAST:], trajectory.output[-LAST:]
-    within = np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint)
-    return np.asarray(within.all(axis=0))
+    setpoint = trajectory.setpoint[-LAST:]
+    output = trajectory.output[-LAST:]
+    is_within = np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint)
+    return np.asarray(is_within.all(axis=0))

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class Scenario:
     name: str
     title: str
     samples: int
-    arguments: dict[str, Any]
+    arguments: Arguments
 
     @property
     def parameters(self) -> Parameters:
@@ -36,33 +36,52 @@ class Scenario:
         return Parameters(**self.arguments)
 
 
+class _PaperPlant(NamedTuple):
+    """A plant of the paper, as part of a scenario's name and title."""
+
+    suffix: str
+    preset: str
+    title: str
+
+
 # The text of the paper describes the plants; only its figures show the set point. Two set
 # points are used here: the environment's square wave between +5 and -5 degC, 300 samples each,
 # over two periods; and a step to 5 degC.
-_PLANTS = (
-    ("", "paper", "dead zone 5 t/h, no noise (Figs 5 and 10)"),
-    ("-dead-zone-7", "dead-zone-7", "dead zone 7 t/h, no noise (Figs 6 and 7)"),
-    ("-noise", "noisy", "dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)"),
+_PAPER_PLANTS = (
+    _PaperPlant("", "paper", "dead zone 5 t/h, no noise (Figs 5 and 10)"),
+    _PaperPlant("-dead-zone-7", "dead-zone-7", "dead zone 7 t/h, no noise (Figs 6 and 7)"),
+    _PaperPlant("-noise", "noisy", "dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)"),
 )
-SETPOINTS: tuple[tuple[str, str, int, dict[str, Any]], ...] = (
-    ("square", "square wave", 1200, {}),
-    ("constant", "constant set point", 600, {"setpoint": 5.0}),
+SETPOINTS = (
+    Scenario("square", "square wave", 1200, {}),
+    Scenario("constant", "constant set point", 600, {"setpoint": 5.0}),
 )
-SCENARIOS = {
-    setpoint + suffix: Scenario(
-        setpoint + suffix, f"{title}, {plant}", samples, {**PRESETS[preset], **arguments}
-    )
-    for setpoint, title, samples, arguments in SETPOINTS
-    for suffix, preset, plant in _PLANTS
-} | {
+"""The set points of the paper's cases, on the environment's default plant."""
+
+
+def _paper_scenarios() -> dict[str, Scenario]:
+    """Return every set point on every plant of the paper, and steps of the load, by name."""
+    scenarios = [
+        Scenario(
+            setpoint.name + plant.suffix,
+            f"{setpoint.title}, {plant.title}",
+            setpoint.samples,
+            {**PRESETS[plant.preset], **setpoint.arguments},
+        )
+        for setpoint in SETPOINTS
+        for plant in _PAPER_PLANTS
+    ]
     # A boiler's daily duty. At 5 degC the required flow stays outside the dead zone.
-    "load": Scenario(
+    load = Scenario(
         "load",
         "load steps within ±1.5 °C at a held set point, dead zone 5 t/h, no noise",
         1200,
         {"setpoint": 5.0, "disturbance_amplitude": 1.5, "disturbance_interval": 200.0},
     )
-}
+    return {scenario.name: scenario for scenario in [*scenarios, load]}
+
+
+SCENARIOS = _paper_scenarios()
 PRESET_SCENARIOS = {
     name: Scenario(name, f"preset {name}", 1200, dict(arguments))
     for name, arguments in PRESETS.items()
@@ -100,31 +119,42 @@ class PlantOptions:
             words += ["--set", argument]
         return words
 
-    def cases(self, others: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
-        """Return the cases for the chosen plant, or the others if none is chosen.
+    def cases(self, default: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
+        """Return the cases of the chosen plant by name, or `default` if no plant is chosen.
 
-        They use the set points of the paper's cases, unless the arguments define a set point:
-        then there is one case, with that set point.
+        The cases have the set points of the paper's cases. If the arguments of the plant define
+        a set point, there is one case, with that set point.
         """
         arguments = self.arguments()
         if not self.name:
-            return others
-        own = {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments)
-        cases = [("run", "its own set point", 1200, {})] if own else SETPOINTS
+            return default
+        setpoints: tuple[Scenario, ...] = SETPOINTS
+        if {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments):
+            setpoints = (Scenario("run", "its own set point", 1200, {}),)
         return {
-            name: Scenario(name, f"{title}, {self.name}", samples, {**arguments, **more})
-            for name, title, samples, more in cases
+            setpoint.name: Scenario(
+                setpoint.name,
+                f"{setpoint.title}, {self.name}",
+                setpoint.samples,
+                {**arguments, **setpoint.arguments},
+            )
+            for setpoint in setpoints
         }
 
-    def arguments(self) -> dict[str, Any]:
-        """Return those that differ from the defaults; `UsageError` if one is invalid."""
-        arguments: dict[str, Any] = dict(PRESETS[self.preset]) if self.preset else {}
+    def arguments(self) -> Arguments:
+        """Return the arguments of the environment that differ from the defaults.
+
+        A `UsageError` names the option if an argument is unknown or invalid.
+        """
+        arguments: Arguments = {}
+        if self.preset:
+            arguments |= PRESETS[self.preset]
         if self.plant:
             try:
                 arguments |= dict(**json.loads(self.plant.read_text(encoding="utf-8")))
-            except (OSError, TypeError, ValueError) as error:  # not there, no object, no JSON
-                like = 'a JSON file of arguments, such as {"delay": 20}'
-                raise UsageError(f"--plant: {self.plant} must be {like}: {error}") from error
+            except (OSError, TypeError, ValueError) as error:  # no file, no object, no JSON
+                allowed = 'a JSON file of arguments, such as {"delay": 20}'
+                raise UsageError(f"--plant: {self.plant} must be {allowed}: {error}") from error
         for text in self.set:
             name, equals, value = text.partition("=")
             if not (name and equals):
@@ -132,7 +162,7 @@ class PlantOptions:
             arguments[name] = value  # a bare word, such as random
             with suppress(ValueError):
                 arguments[name] = json.loads(value)
-        given = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
+        options = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
         try:
             a = Parameters.of_environment(arguments).a
             if abs(slowest_pole(a) or 0.0) > 1.0:
@@ -141,12 +171,12 @@ class PlantOptions:
                     f"plant, got {list(a)}"
                 )
         except (TypeError, ValueError) as error:  # the first: of an unknown argument
-            raise UsageError(f"{', '.join(given)}: {error}") from error
+            raise UsageError(f"{', '.join(options)}: {error}") from error
         return arguments
 
 
-# Ranges of the plants drawn for sweeps and for training. With a gain factor below 0.74, 5 degC
-# is beyond the limits.
+# Ranges of the random plants of sweeps and of training. With a gain factor below 0.74, 5 degC
+# is out of the flow's reach.
 SPANS = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),
@@ -165,37 +195,46 @@ def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
     from scipy.stats.qmc import LatinHypercube  # here: slow to import
 
     drifts = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_drift"}
+    # A column for each argument, then one for each factor at the end of its drift.
     low, high = np.array([*SPANS.values(), *(SPANS[name] for name in drifts)]).T
-    drawn = LatinHypercube(len(low), rng=np.random.default_rng(seed)).random(count)
+    shares = LatinHypercube(len(low), rng=np.random.default_rng(seed)).random(count)
     plants: list[Arguments] = []
-    for row in (low + drawn * (high - low)).round(4).tolist():
-        plant = dict(zip(SPANS, row, strict=False)) | {"delay": round(row[0])}
+    for row in (low + shares * (high - low)).round(4).tolist():
+        plant = dict(zip(SPANS, row, strict=False))
+        plant["delay"] = round(plant["delay"])
         if len(plants) >= count // 2:
-            ends = zip(drifts.items(), row[len(SPANS) :], strict=True)
-            plant |= {drift: end / plant[factor] for (factor, drift), end in ends}
+            final_factors = row[len(SPANS) :]
+            for (factor, drift), final in zip(drifts.items(), final_factors, strict=True):
+                plant[drift] = final / plant[factor]
             plant["drift_samples"] = samples
         plants.append(plant)
     return plants
 
 
 def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
-    """Return the plants of a design, which are around the paper's, around another plant.
+    """Return a design around the paper's plant, moved to another plant.
 
-    They differ from it by the same factors: the delay, the dead zone and the factors on gain
-    and time constant, and the noise variance as a share of the square of what the flow reaches.
+    The plants differ from `plant` by the same factors as those of the design from the paper's:
+    in delay, dead zone, the factors of gain and time constant, and in the noise variance as a
+    share of the square of the temperature change that the flow can cause.
     """
-    here, paper = (np.array(_scales(Parameters(**each))) for each in (plant, {}))
-    factors = dict(zip(SPANS, (here / paper).tolist(), strict=True))
-    moved = [{name: factors.get(name, 1.0) * each[name] for name in each} for each in design]
-    whole = "delay", "drift_samples"
-    return [
-        each | {name: round(each[name]) for name in whole if name in each} for each in moved
-    ]
+    scales = _scales(Parameters(**plant))
+    paper_scales = _scales(Parameters())
+    moved_design: list[Arguments] = []
+    for designed in design:
+        moved: Arguments = {}
+        for name, value in designed.items():
+            factor = scales[name] / paper_scales[name] if name in SPANS else 1.0
+            moved[name] = factor * value
+            if name in ("delay", "drift_samples"):
+                moved[name] = round(moved[name])
+        moved_design.append(moved)
+    return moved_design
 
 
-def _scales(plant: Parameters) -> list[float]:
-    """Return a plant's delay, dead zone, variance of the reach, and factors, as in `SPANS`."""
+def _scales(plant: Parameters) -> dict[str, float]:
+    """Return what the values of a design are multiples of, by their names in `SPANS`."""
     model = nominal(plant)
-    reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0
-    middle = {**vars(model.numbers), "noise_variance": reach**2}
-    return [middle[name] for name in SPANS]
+    reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0  # degC
+    scales = {**vars(model.numbers), "noise_variance": reach**2}
+    return {name: float(scales[name]) for name in SPANS}
