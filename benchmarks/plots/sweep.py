@@ -151,7 +151,10 @@ def map_finding(plants: pd.DataFrame) -> str:
     if len(shares) == 1:
         return finding
     second = str(shares.index[1])
-    return f"{finding}, {label(second)} on {percent(shares[second])}, all others on fewer"
+    finding += f", {label(second)} on {percent(shares[second])}"
+    if len(shares) == 2:
+        return finding
+    return f"{finding}; no other controller is on more"
 
 
 def _draw_controller(axes: Axes, plants: pd.DataFrame, colours: ScalarMappable) -> None:
