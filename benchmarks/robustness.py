@@ -146,25 +146,26 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator, NullLocator
 
-    from benchmarks.lib.report import panels
+    from benchmarks.lib.pictures import open_panels
 
-    with panels(path, [*PICTURED.values()], 3.1, 2, finding(rows)) as (figure, axes):
-        for panel, case in zip(axes, PICTURED, strict=True):
+    with open_panels(path, [*PICTURED.values()], 3.1, 2, finding(rows)) as panels:
+        for panel, case in zip(panels.axes, PICTURED, strict=True):
             of_case = rows[rows["case"] == case]
             for name in RULES:
                 _draw_rule(panel, of_case[of_case["agent"] == name], name)
             panel.set_xlabel("valve travel in a run (t/h)")
             panel.yaxis.set_major_locator(MaxNLocator(5))
-        axes[0].set_xscale("log")
+        first = panels.axes[0]
+        first.set_xscale("log")
         ticks = [200, 500, 1000, 2000, 5000]
-        axes[0].set_xticks(ticks, [f"{tick:,}" for tick in ticks])
-        axes[0].xaxis.set_minor_locator(NullLocator())
-        axes[0].set_ylabel("mean error / lowest achievable")
-        handles, names = axes[0].get_legend_handles_labels()
+        first.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+        first.xaxis.set_minor_locator(NullLocator())
+        first.set_ylabel("mean error / lowest achievable")
+        handles, names = first.get_legend_handles_labels()
         large: Any = {"marker": "o", "markersize": 9, "markeredgecolor": "k", "linestyle": ""}
         handles.append(Line2D([], [], color="0.8", **large))
         names.append(f"Ms {ROBUSTNESS:g}; numbers: Ms of the ends")
-        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+        panels.figure.legend(handles, names, loc="outside lower center", ncols=len(names))
 
 
 def _draw_rule(panel: Any, rows: pd.DataFrame, name: str) -> None:

@@ -47,7 +47,7 @@ TEXT = (
     f"on steady stretches the standard deviation of the error is {OSCILLATES:g} °C larger "
     "than without control. This, and no better than no control, are shares of the runs."
 )
-PICTURE = "Error on each plant, as a multiple of the least possible"
+PICTURE = "The error of each controller on each plant, relative to the lowest achievable error"
 GROUPS = {  # of the plants of a random design, a row each
     "no drift": "gain_drift.isna()",
     "all that drift": "gain_drift > 0",
@@ -227,6 +227,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) -> None:
     """Draw the map, write the report and print it; of plants that drift, with `QUESTIONS`."""
     from benchmarks.lib.report import Section, write_report
+    from benchmarks.plots.sweep import draw
 
     draw(runs, out / "map.png", nominal)
     overview = summarise(runs)
@@ -265,38 +266,6 @@ def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.Data
             row[f"{label(first)} - {label(second)}"] = f"{estimate:+.3f}"
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
-    """Draw each controller's errors over delay and gain, the median of each plant."""
-    from matplotlib.colors import LogNorm
-
-    from benchmarks.lib.report import MULTIPLE, panels, scale_by_excess
-
-    centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
-    square_style: Any = {"marker": "s", "cmap": "cividis_r", "norm": LogNorm(0.01, 3.0)}
-    names = list(runs["agent"].unique())
-    with panels(path, [*map(label, names)], 2.3, 3, PICTURE) as (figure, axes):
-        for panel, name in zip(axes, names, strict=True):
-            plants = runs[runs["agent"] == name].groupby("plant")
-            delay, gain = plants["delay"].first(), plants["gain_factor"].first()
-            excess = plants["ratio"].median().sub(1.0).clip(lower=0.01)
-            image = panel.scatter(delay, gain, 20, excess, **square_style)
-            # Where this holds for at least half of the runs.
-            oscillates = plants["oscillates"].mean() >= 0.5
-            useless = plants["useless"].mean() >= 0.5
-            panel.plot(
-                delay[oscillates], gain[oscillates], "wo", ms=3.5, mec="k", label="oscillates"
-            )
-            panel.plot(delay[useless], gain[useless], "rX", label="no better than no control")
-            panel.plot(*centre, "k+", ms=12, label="the nominal plant")
-        for panel in axes[-3:]:
-            panel.set_xlabel("delay (samples)")
-        figure.supylabel("gain factor", fontsize="medium")
-        bar_style: Any = {"location": "bottom", "aspect": 60, "extend": "both"}
-        bar = figure.colorbar(image, ax=axes, label=MULTIPLE, **bar_style)
-        scale_by_excess(bar.ax, "x", 0.013, 3.0 / 1.3)
-        figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
 
 main = command("sweep", Options, work)

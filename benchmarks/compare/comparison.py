@@ -80,9 +80,10 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
 
 
 def _responses(members: Sequence[Trajectory], scenario: Scenario, agent: str) -> pd.DataFrame:
-    """Return the set point and percentiles of y and u_a over the runs, one row per sample.
+    """Return the set point, the first run, and percentiles over the runs, one row per sample.
 
-    If the runs differ in their set points, the first run stands for all.
+    The signals are the output and the applied flow. If the runs differ in their set points,
+    the percentiles are those of the first run alone.
     """
     setpoint = members[0].setpoint[:, 0]
     k = np.arange(len(setpoint))
@@ -90,6 +91,7 @@ def _responses(members: Sequence[Trajectory], scenario: Scenario, agent: str) ->
     columns = {"agent": agent, "sample": k, "time_s": k * interval, "setpoint": setpoint}
     for signal in ("output", "applied"):
         values = np.hstack([getattr(each, signal) for each in members])
+        columns[f"{signal}_run"] = values[:, 0]
         # Values that occurred: an interpolated applied input could lie in the dead zone.
         drawn = scenario.parameters.setpoint == "random"
         found = percentiles(values[:, :1] if drawn else values, "nearest")

@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.identify.model import Model
-from benchmarks.lib.report import COLOURS, Section, drawn
+from benchmarks.lib.pictures import COLOURS, open_picture
+from benchmarks.lib.report import Section
 from benchmarks.lib.statistics import ENDS
 
 SHOWN = slice(-4_000, None)  # rows that are drawn: more would blur
@@ -61,7 +62,7 @@ def draw(model: Model, path: Path) -> None:
     log, h, plant = model.log, model.log.sampling_interval, model.plant
     flow, degree = log.given.flow_unit, log.given.temperature_unit
     minutes = (np.arange(len(log.flow)) * h / 60.0)[SHOWN]
-    with drawn(path, 5, TITLE) as figure:
+    with open_picture(path, 5, TITLE) as figure:
         places = figure.subplot_mosaic([["y", "y"], ["u", "step"]], height_ratios=[3, 2])
         above, below, step = places.values()
         above.plot(minutes, log.temperature[SHOWN], color="0.5", lw=1, label="recorded")

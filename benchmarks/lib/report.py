@@ -1,29 +1,20 @@
-"""Write a report as Markdown, and as one HTML page with its pictures; print its tables.
-
-All pictures have one style: white, 750 pixels wide on a page, few colours.
-"""
+"""Write a report as Markdown, and as one HTML page with its pictures; print its tables."""
 
 from __future__ import annotations
 
 import base64
 import html
-import math
 import re
 import shutil
 import textwrap
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
-from benchmarks.lib.storage import replacing, write_text
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from benchmarks.lib.storage import write_text
 
 _HEAD = """\
 <!doctype html><html lang="en">
@@ -149,64 +140,3 @@ def on_screen(table: pd.DataFrame) -> str:
     cells = table.astype(str).set_index(first).rename_axis(index=None, columns=first)
     with pd.option_context("display.max_colwidth", None):
         return cells.to_string(line_width=width - 2, max_rows=None)
-
-
-COLOURS = "#0072B2", "#D55E00"  # of lines that stand for no controller
-MULTIPLE = "multiple of the least possible\n(log scale of the excess over 1)"
-NEAREST = 1e-3  # excess over the least possible error at which a logarithmic axis begins
-STYLE: Any = {
-    "axes.grid": True,
-    "axes.titlelocation": "left",
-    "axes.titlesize": "medium",
-    "figure.constrained_layout.use": True,
-    "figure.dpi": 130,
-    "font.size": 9,
-    "grid.alpha": 0.3,
-    "text.parse_math": False,  # names of controllers may have a dollar
-}
-
-
-@contextmanager
-def drawn(path: Path, height: float, title: str) -> Iterator[Figure]:
-    """Yield a figure of a height in inches, and save it, completely or not at all."""
-    import matplotlib as mpl  # here: slow to import, and many reports have no picture
-    from matplotlib.figure import Figure
-    from PIL import Image
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.5, height))
-        lines = textwrap.fill(title[0].upper() + title[1:], 86)
-        figure.suptitle(lines, x=0.01, ha="left", fontsize=10, weight="bold")
-        yield figure
-        with replacing(path) as partial:
-            figure.savefig(partial)
-            # A quarter of the size. The clustering keeps the colours of small marks.
-            picture = Image.open(partial).convert("RGB")
-            picture.quantize(128, Image.Quantize.MAXCOVERAGE, kmeans=3).save(partial)
-
-
-@contextmanager
-def panels(
-    path: Path, names: Sequence[str], height: float, columns: int, title: str
-) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Yield a figure with a panel of a height in inches for each name, and save it."""
-    columns = min(columns, len(names))
-    rows = math.ceil(len(names) / columns)
-    with drawn(path, height * rows + 1.2, title) as figure:
-        axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for panel, name in zip(axes, names, strict=False):
-            panel.set_title(name)
-        for panel in axes[len(names) :]:
-            panel.set_axis_off()
-        yield figure, axes[: len(names)]
-
-
-def scale_by_excess(axes: Axes, name: str, low: float, high: float) -> None:
-    """Make the axis "x" or "y" of `multiple - 1` logarithmic, with multiples as its ticks."""
-    from matplotlib import ticker
-
-    axes.set(**{f"{name}scale": "log", f"{name}lim": (low / 1.3, high * 1.3)})
-    axis = getattr(axes, f"{name}axis")
-    axis.set_major_locator(ticker.FixedLocator([0.001, 0.01, 0.1, 0.5, 1.0, 4.0, 9.0, 29.0]))
-    axis.set_major_formatter(lambda excess, _: f"{1 + excess:g}")
-    axis.set_minor_locator(ticker.NullLocator())

@@ -1,0 +1,184 @@
+"""Draw the results of a sweep: a map of a grid of plants, or the plants sorted by error.
+
+The title of each picture states what its data show.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from benchmarks.controllers.roster import label, looks
+from benchmarks.lib.pictures import (
+    RATIO_LABEL,
+    excess,
+    open_panels,
+    open_picture,
+    percent,
+    scale_by_ratio,
+)
+from mptc_gym import Parameters
+
+NEAR = 1.05  # An error counts as near the lowest achievable one up to this multiple.
+OFTEN = 0.5  # share of the runs on a plant from which a mark of the map is drawn
+CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
+COLOUR_MAP = "viridis_r"
+NO_RATIO = "0.85"  # colour of a plant without a lowest achievable error
+OSCILLATES: Any = {"color": "white", "marker": "o", "mec": "black", "ms": 3, "linestyle": ""}
+USELESS = "#E31A1C"  # colour of a plant on which control is no better than an idle valve
+NOMINAL: Any = {"color": "black", "marker": "+", "ms": 12, "mew": 1.8, "linestyle": ""}
+
+
+def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
+    """Draw a map of plants that differ in delay and gain alone, or else the sorted errors.
+
+    Parameters
+    ----------
+    runs : pandas.DataFrame
+        A row for each run, as `sweep.table` returns it.
+    path : Path
+        The PNG file.
+    nominal : Parameters
+        The plant around which the others are.
+    """
+    plants = plant_medians(runs)
+    if "dead_zone" in runs:
+        draw_sorted(plants, path)
+    else:
+        draw_map(plants, path, nominal)
+
+
+def plant_medians(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each controller and plant, controllers with smaller errors first.
+
+    The columns are `agent`, `plant`, `delay`, `gain_factor`, `ratio` (that of the median run)
+    and the shares of runs that oscillate (`oscillates`) and that are no better than an idle
+    valve (`useless`).
+    """
+    groups = runs.groupby(["agent", "plant"], sort=False)
+    plants = groups[["delay", "gain_factor"]].first()
+    plants["ratio"] = groups["ratio"].median()
+    plants[["oscillates", "useless"]] = groups[["oscillates", "useless"]].mean()
+    plants = plants.reset_index()
+    plants["middle"] = plants.groupby("agent")["ratio"].transform("median")
+    return plants.sort_values("middle", kind="stable").drop(columns="middle")
+
+
+def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
+    """Draw the error ratios of each controller over the plants, sorted by the ratio.
+
+    `plants` are those of `plant_medians`. Plants without a ratio are left out.
+    """
+    plants = plants.dropna(subset=["ratio"])
+    agents = list(plants["agent"].unique())
+    styles = looks(agents)
+    with open_picture(path, 4.6, sorted_finding(plants)) as figure:
+        axes = figure.subplots()
+        for agent in agents:
+            ratios = np.sort(plants.loc[plants["agent"] == agent, "ratio"])
+            shares = 100.0 * (np.arange(len(ratios)) + 1.0) / len(ratios)
+            colour, marker = styles[agent]
+            look: Any = {"color": colour, "marker": marker, "ms": 5, "markevery": 0.1}
+            axes.plot(shares, excess(ratios), label=label(agent), linewidth=1.3, **look)
+        if agents:
+            scale_by_ratio(axes, "y", plants["ratio"])
+            handles, texts = axes.get_legend_handles_labels()
+            # The controller with the largest errors is the uppermost line.
+            figure.legend(handles[::-1], texts[::-1], loc="outside right center")
+        axes.set_xlim(0.0, 100.0)
+        axes.set_xlabel("share of the plants (%), sorted by the error of each controller")
+        axes.set_ylabel(RATIO_LABEL)
+
+
+def sorted_finding(plants: pd.DataFrame) -> str:
+    """Return a sentence on the 90th percentiles of the error ratios over the plants."""
+    ratios = plants.groupby("agent")["ratio"].quantile(0.9).sort_values()
+    if ratios.empty:
+        return "No plant has a lowest achievable error"
+    texts = [f"{ratio:.2f} for {label(str(agent))}" for agent, ratio in ratios.items()]
+    finding = f"On nine plants out of ten, the error ratio is at most {texts[0]}"
+    if len(texts) > 2:
+        finding += f", {texts[1]}"
+    if len(texts) > 1:
+        finding += f" and {texts[-1]}"
+    return finding
+
+
+def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
+    """Draw the error ratio over delay and gain, a panel for each controller, the best first.
+
+    `plants` are those of `plant_medians`.
+    """
+    agents = list(plants["agent"].unique())
+    names = [label(agent) for agent in agents]
+    colours = ScalarMappable(BoundaryNorm(CLASSES, ncolors=256, extend="max"), COLOUR_MAP)
+    centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
+    with open_panels(path, names, 1.9, 3, map_finding(plants)) as panels:
+        for axes, agent in zip(panels.axes, agents, strict=True):
+            _draw_controller(axes, plants[plants["agent"] == agent], colours)
+            axes.plot(*centre, **NOMINAL)
+        panels.label_edges("delay (samples)", "gain factor")
+        panels.add_legend(_legend_of_map(plants), columns=4)
+        bar = panels.figure.colorbar(
+            colours, ax=panels.figure.axes, location="bottom", aspect=60
+        )
+        bar.set_label("error / lowest achievable error")
+        bar.set_ticks(CLASSES, labels=[f"{ratio:g}" for ratio in CLASSES])
+
+
+def map_finding(plants: pd.DataFrame) -> str:
+    """Return a sentence on the shares of plants with nearly the lowest achievable error."""
+    with_ratio = plants.dropna(subset=["ratio"])
+    is_near = with_ratio["ratio"] <= NEAR
+    shares = is_near.groupby(with_ratio["agent"]).mean()
+    shares = shares.sort_values(ascending=False, kind="stable")
+    if shares.empty:
+        return "Where each controller oscillates"
+    first = str(shares.index[0])
+    finding = (
+        f"{label(first)} is within {percent(NEAR - 1.0)} of the lowest achievable error on "
+        f"{percent(shares[first])} of the plants"
+    )
+    if len(shares) == 1:
+        return finding
+    second = str(shares.index[1])
+    finding += f", {label(second)} on {percent(shares[second])}"
+    if len(shares) == 2:
+        return finding
+    return f"{finding}; no other controller is on more"
+
+
+def _draw_controller(axes: Axes, plants: pd.DataFrame, colours: ScalarMappable) -> None:
+    """Draw a cell for each plant, in the colour of its error ratio, and marks for failures."""
+    cells = plants.pivot_table(
+        index="gain_factor", columns="delay", values="ratio", dropna=False
+    )
+    axes.set_facecolor(NO_RATIO)
+    axes.grid(visible=False)
+    axes.pcolormesh(cells.columns, cells.index, cells, norm=colours.norm, cmap=colours.cmap)
+    useless = plants.pivot_table(index="gain_factor", columns="delay", values="useless")
+    red = useless.where(useless >= OFTEN)  # NaN, which is transparent, elsewhere
+    axes.pcolormesh(red.columns, red.index, red, cmap=ListedColormap([USELESS]))
+    marked = plants[(plants["oscillates"] >= OFTEN) & (plants["useless"] < OFTEN)]
+    axes.plot(marked["delay"], marked["gain_factor"], **OSCILLATES)
+
+
+def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
+    """Return the marks that are in a map, by their texts."""
+    entries: dict[str, Artist] = {"the nominal plant": Line2D([], [], **NOMINAL)}
+    if (plants["oscillates"] >= OFTEN).any():
+        entries["oscillates"] = Line2D([], [], **OSCILLATES)
+    if (plants["useless"] >= OFTEN).any():
+        entries["no better than an idle valve"] = Patch(color=USELESS)
+    if plants["ratio"].isna().any():
+        entries["lowest achievable error unknown"] = Patch(color=NO_RATIO)
+    return entries

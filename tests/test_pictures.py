@@ -1,0 +1,198 @@
+"""Pictures say what their data show, and show all of it."""
+
+from contextlib import contextmanager
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from benchmarks.compare import plots
+from benchmarks.controllers.roster import looks
+from benchmarks.lib.pictures import STYLE, open_picture, scale_by_ratio
+from benchmarks.lib.statistics import Estimate
+from benchmarks.loop.scenarios import SCENARIOS, Scenario
+from benchmarks.plots import sweep
+from mptc_gym import Parameters
+
+
+def ticks(axis):
+    return [tick.get_text() for tick in axis.get_ticklabels()]
+
+
+class TestFindings:
+    def test_of_scores(self):
+        scores = {"mpc": 0.998, "nn-smith": 0.9971, "mine": 0.9, "pi": -0.0001}
+        estimates = {agent: Estimate(x, x, x, 1) for agent, x in scores.items()}
+        assert plots.scores_finding(estimates) == (
+            "MPC scores highest with 0.998, neural Smith follows with 0.997; "
+            "PI (1992) scores lowest with 0.000"
+        )
+        assert plots.scores_finding({"mine": estimates["mine"]}) == "mine scores 0.900"
+
+    def test_of_travel(self):
+        rows = [
+            # scenario, agent, error, travel: in "a", Smith's error is 6 % above the smallest.
+            ("a", "smith", 1.06, 10.0), ("a", "pi", 1.04, 20.0), ("a", "mpc", 1.0, 30.0),
+            ("b", "smith", 1.04, 10.0), ("b", "pi", 1.00, 20.0), ("b", "mpc", 2.0, 1.0),
+            ("c", "smith", 3.00, 10.0), ("c", "pi", 1.00, 20.0), ("c", "mpc", 2.0, 1.0),
+        ]  # fmt: skip
+        means = pd.DataFrame(rows, columns=["scenario", "agent", "mae", "travel"])
+        finding = plots.travel_finding(means)
+        assert finding.endswith("PI (1992) moves the valve least in 2 of 3 cases")
+        assert "within 5 % of the smallest" in finding
+        alone = plots.travel_finding(means[means["agent"] == "pi"])
+        assert alone == "Mean error and valve travel of PI (1992)"
+
+    def test_of_responses(self):
+        errors = pd.Series({"mpc": 0.5, "nn": 1.0, "pi": 1.27})
+        finding = plots.responses_finding(errors)
+        assert finding == "the mean error of PI (1992) is 2.5 times that of MPC"
+
+    def test_of_plants(self):
+        ratios = {"pi": [1.0, 2.0, 3.0, np.nan], "smith": [1.01, 1.04, 1.2, 1.05]}
+        rows = [(agent, ratio) for agent, of in ratios.items() for ratio in of]
+        plants = pd.DataFrame(rows, columns=["agent", "ratio"])
+        assert sweep.map_finding(plants) == (
+            "Smith is within 5 % of the lowest achievable error on 75 % of the plants, "
+            "PI (1992) on 33 %"
+        )
+        assert sweep.sorted_finding(plants) == (
+            "On nine plants out of ten, the error ratio is at most 1.16 for Smith and 2.80 for "
+            "PI (1992)"
+        )
+
+
+def test_a_ratio_below_the_axis_is_said_at_its_tick():
+    for ratios, lowest in (([1.5, 1.002], "1.001"), ([1.5, 0.98], "≤ 1.001")):
+        axes = Figure().subplots()
+        scale_by_ratio(axes, "y", ratios)
+        assert ticks(axes.yaxis)[:3] == [lowest, "1.003", "1.01"]
+        low, high = axes.get_ylim()
+        assert 0.0 < low < 0.002 < 0.5 < high
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """Return the figures that are made, in place of files."""
+    figures = []
+
+    @contextmanager
+    def open_picture(path, height, title):
+        with rc_context(STYLE):
+            figures.append(Figure())
+            figures[-1].suptitle(title)
+            yield figures[-1]
+
+    monkeypatch.setattr(plots, "open_picture", open_picture)
+    return figures
+
+
+def test_scores_beyond_the_axis_stand_at_its_ends(figures, tmp_path):
+    values = {"mpc": [1.2, 0.9], "pi": [0.5, -3.0]}
+    rows = [
+        {"scenario": case, "agent": agent, "scores": np.array([[score]])}
+        for agent, scores in values.items()
+        for case, score in zip(["a", "b"], scores, strict=True)
+    ]
+    means = {agent: np.mean(scores) for agent, scores in values.items()}
+    scores = {agent: Estimate(mean, mean, mean, 2) for agent, mean in means.items()}
+    plots.plot_scores(scores, pd.DataFrame(rows), tmp_path / "scores.png")
+    (axes,) = figures[0].axes
+    labels = ticks(axes.xaxis)
+    assert (labels[0], labels[-1]) == ("≤ -0.5", "≥ 0.999")
+    shown = np.concatenate([line.get_xdata() for line in axes.get_lines()])
+    right, left = sorted(axes.get_xlim())
+    assert ((right < shown) & (shown < left)).all()
+    assert len(shown) == 2 * (2 + 1)
+
+
+def responses(agent, outputs, spread=0.0):
+    """Return responses over 80 minutes."""
+    seconds = 8.0 * np.arange(600)
+    output = np.resize(outputs, 600).astype(float)
+    return pd.DataFrame(
+        {
+            "agent": agent, "time_s": seconds, "setpoint": 5.0, "output_run": output,
+            "output_median": 5.0, "output_p10": 5.0 - spread, "output_p90": 5.0 + spread,
+            "applied_run": -10.0,
+        }
+    )  # fmt: skip
+
+
+class TestResponses:
+    def test_the_first_run_is_shown_in_whole_and_as_a_temperature(self, figures, tmp_path):
+        rows = pd.concat([responses("pi", [3.0, 7.0]), responses("smith", [5.0])])
+        errors = pd.Series({"pi": 2.0, "smith": 1.0})
+        plots.plot_responses(rows, errors, SCENARIOS["constant"], tmp_path / "constant.png")
+        smith, _, pi, flow = figures[0].axes
+        assert smith.get_title(loc="left") == "Smith: mean error 1.000 °C"
+        (run,) = [line for line in pi.get_lines() if line.get_color() == looks(["pi"])["pi"][0]]
+        np.testing.assert_array_equal(run.get_ydata()[-2:], [3.0, 7.0])
+        low, high = pi.get_ylim()
+        assert low < 3.0 < 7.0 < high
+        assert flow.get_xlim() == (0.0, pytest.approx(599 * 8 / 60))
+        assert "2.0 times that of Smith" in figures[0].get_suptitle()
+
+    @pytest.mark.parametrize(
+        ("spread", "plant", "texts"),
+        [
+            (0.0, {}, ["set point", "dead zone", "limits"]),
+            (
+                1.0, {"dead_zone": [3, 7]},
+                [
+                    "set point", "first run; 10th to 90th percentile of all",
+                    "smallest dead zone", "limits",
+                ],
+            ),
+            (
+                0.0, {"setpoint": "random", "u_max": [8, 10]},
+                ["set point", "first run", "dead zone", "widest limits"],
+            ),
+        ],
+    )  # fmt: skip
+    def test_the_legend_names_what_is_there(self, spread, plant, texts, figures, tmp_path):
+        rows = responses("pi", [5.0], spread)
+        case = Scenario("case", "a case", 600, plant)
+        plots.plot_responses(rows, pd.Series({"pi": 1.0}), case, tmp_path / "case.png")
+        (legend,) = figures[0].legends
+        assert [text.get_text() for text in legend.get_texts()] == texts
+
+
+def runs_on_plants(**columns):
+    rows = [
+        {"agent": agent, "plant": i, "delay": 10 + i // 2, "gain_factor": 0.9 + 0.1 * (i % 2)}
+        for agent in ("pi", "smith")
+        for i in range(4)
+    ]
+    runs = pd.DataFrame(rows)
+    runs["ratio"] = np.where(runs["agent"] == "pi", 2.0, 1.1)
+    return runs.assign(**{"oscillates": False, "useless": False, **columns})
+
+
+def test_controllers_of_a_sweep_are_sorted_by_result():
+    plants = sweep.plant_medians(runs_on_plants())
+    assert list(plants["agent"].unique()) == ["smith", "pi"]
+
+
+@pytest.mark.parametrize("columns", [{}, {"dead_zone": 5.0}, {"ratio": np.nan}])
+def test_any_sweep_can_be_drawn(columns, tmp_path):
+    runs = runs_on_plants(**columns)
+    for shown in (runs, runs[runs["plant"] == 0]):  # a stopped sweep may have one plant
+        path = tmp_path / "map.png"
+        sweep.draw(shown, path, Parameters())
+        assert path.stat().st_size > 1000
+
+
+def test_a_picture_that_fails_leaves_the_old_one(tmp_path):
+    path = tmp_path / "picture.png"
+    path.write_text("old")
+
+    def fail():
+        with open_picture(path, 2.0, "a title"):
+            raise ArithmeticError
+
+    with pytest.raises(ArithmeticError):
+        fail()
+    assert path.read_text() == "old"
