@@ -118,10 +118,11 @@ def _scale_by_score(axes: Axes, shown: Sequence[float]) -> None:
         labels[0] = f"≤ {labels[0]}"
     if max(shown) > HIGHEST_SCORE:
         labels[-1] = f"≥ {labels[-1]}"
-    first = 1.15 * distance(min(0.0, *shown))
+    start = 1.15 * float(distance(min(0.0, *shown)))
+    end = float(distance(HIGHEST_SCORE)) / 1.3
     axes.set_xscale("log")
     axes.set_xticks(distance(SCORE_TICKS), labels)
-    axes.set_xlim(first, distance(HIGHEST_SCORE) / 1.3)
+    axes.set_xlim(start, end)
     axes.xaxis.set_minor_locator(NullLocator())
 
 
@@ -149,8 +150,10 @@ def plot_travel(
     with open_panels(path, cases, 2.4, 2, travel_finding(means)) as panels:
         for axes, case in zip(panels.axes, cases, strict=True):
             rows = means[means["scenario"] == case]
-            for row in rows.itertuples():
-                axes.plot(row.travel, excess(row.ratio), **marks[row.agent])
+            for agent, travel, ratio in zip(
+                rows["agent"], rows["travel"], rows["ratio"], strict=True
+            ):
+                axes.plot(travel, excess(ratio), **marks[agent])
             scale_by_ratio(axes, "y", rows["ratio"])
             _scale_by_travel(axes, rows["travel"])
         entries: dict[str, Artist] = {}
@@ -234,7 +237,9 @@ def plot_responses(
             axes.set_xlabel("time (min)")
             axes.set_xlim(0.0, responses["time_s"].max() / 60.0)
         entries = _legend_of_responses(responses, scenario.parameters)
-        figure.legend(entries.values(), entries, loc="outside lower center", ncols=4)
+        figure.legend(
+            list(entries.values()), list(entries), loc="outside lower center", ncols=4
+        )
 
 
 def responses_finding(errors: pd.Series[float]) -> str:
