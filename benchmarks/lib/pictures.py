@@ -110,12 +110,13 @@ class Panels:
 
         `entries` holds an artist for each text; `columns` is the number of columns below.
         """
+        handles = list(entries.values())
+        texts = list(entries)
         if self.unused:
-            legend = self.unused[0].legend(entries.values(), entries, loc="center left")
+            legend = self.unused[0].legend(handles, texts, loc="center left")
             legend.set_in_layout(False)  # It may be wider than a panel.
             return
-        place = "outside lower center"
-        self.figure.legend(entries.values(), entries, loc=place, ncols=columns)
+        self.figure.legend(handles, texts, loc="outside lower center", ncols=columns)
 
 
 @contextmanager

@@ -81,11 +81,16 @@ class Film:
         return self.run.mean_error(step) / self.reference.mean_error(step)
 
     def compared(self, step: Step) -> str:
-        """Return how the error differs from the reference's on a step, and when it begins."""
+        """Return how the error differs from the reference's on a step.
+
+        Where the film has several steps, the text says when this one begins.
+        """
         difference = self.ratio(step) - 1.0
         size = percent(abs(difference))
         kind = "larger" if difference > 0.0 else "smaller"
         text = "equal" if size == percent(0.0) else f"{size} {kind}"
+        if len(self.steps) == 1:
+            return text
         return f"{text} at {self.interval * step.start:.0f} min"
 
     @property
@@ -192,18 +197,19 @@ def _draw(figure: Figure, film: Film) -> list[Curve]:
     grid[1, 0].set_ylabel("applied flow (t/h)")
     for axes in grid[1]:
         axes.set_xlabel("time since the step (min)")
-    entries = {}
+    entries: dict[str, Any] = {}
     for axes in grid[:, 0]:
         handles, texts = axes.get_legend_handles_labels()
         entries |= dict(zip(texts, handles, strict=True))
-    figure.legend(entries.values(), entries, loc="outside lower center", ncols=len(entries))
+    handles = list(entries.values())
+    figure.legend(handles, list(entries), loc="outside lower center", ncols=len(entries))
     return curves
 
 
 def _draw_step(upper: Axes, lower: Axes, film: Film, step: Step) -> list[Curve]:
     """Draw a step, temperatures above and flows below, and return the curves of the runs."""
     samples = slice(step.start, step.stop)
-    minutes = film.interval * np.arange(step.stop - step.start)
+    minutes = film.interval * np.arange(step.stop - step.start, dtype=np.float64)
     upper.set_title(f"error {film.compared(step)}")
     upper.plot(minutes, film.run.signals.setpoint[samples, 0], label="set point", **SETPOINT)
     lower.axhspan(-film.dead_zone, film.dead_zone, label="dead zone", **DEAD_ZONE)

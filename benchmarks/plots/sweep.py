@@ -120,16 +120,19 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     """
     agents = list(plants["agent"].unique())
     names = [label(agent) for agent in agents]
-    colours = ScalarMappable(BoundaryNorm(CLASSES, ncolors=256, extend="max"), COLOUR_MAP)
+    classes = BoundaryNorm(CLASSES, ncolors=256, extend="max")
     centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
     with open_panels(path, names, 1.9, 3, map_finding(plants)) as panels:
         for axes, agent in zip(panels.axes, agents, strict=True):
-            _draw_controller(axes, plants[plants["agent"] == agent], colours)
+            _draw_controller(axes, plants[plants["agent"] == agent], classes)
             axes.plot(*centre, **NOMINAL)
         panels.label_edges("delay (samples)", "gain factor")
         panels.add_legend(_legend_of_map(plants), columns=4)
         bar = panels.figure.colorbar(
-            colours, ax=panels.figure.axes, location="bottom", aspect=60
+            ScalarMappable(classes, COLOUR_MAP),
+            ax=panels.figure.axes,
+            location="bottom",
+            aspect=60,
         )
         bar.set_label("error / lowest achievable error")
         bar.set_ticks(CLASSES, labels=[f"{ratio:g}" for ratio in CLASSES])
@@ -157,14 +160,14 @@ def map_finding(plants: pd.DataFrame) -> str:
     return f"{finding}; no other controller is on more"
 
 
-def _draw_controller(axes: Axes, plants: pd.DataFrame, colours: ScalarMappable) -> None:
+def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) -> None:
     """Draw a cell for each plant, in the colour of its error ratio, and marks for failures."""
     cells = plants.pivot_table(
         index="gain_factor", columns="delay", values="ratio", dropna=False
     )
     axes.set_facecolor(NO_RATIO)
     axes.grid(visible=False)
-    axes.pcolormesh(cells.columns, cells.index, cells, norm=colours.norm, cmap=colours.cmap)
+    axes.pcolormesh(cells.columns, cells.index, cells, norm=classes, cmap=COLOUR_MAP)
     useless = plants.pivot_table(index="gain_factor", columns="delay", values="useless")
     red = useless.where(useless >= OFTEN)  # NaN, which is transparent, elsewhere
     axes.pcolormesh(red.columns, red.index, red, cmap=ListedColormap([USELESS]))
