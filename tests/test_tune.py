@@ -94,6 +94,8 @@ def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path):
     assert "positive feedback" in spec.misfit(falling)
     controller = spec.make({"b": [0.0456, 0.00404]}, 1, 0)
     assert (controller.kp, controller.ki) == (gains["kp"], gains["ki"])
+    with pytest.raises(UsageError, match=r"'mine' must be one gains\.json or several \.npz"):
+        chosen([], [f"mine={file}"] * 2)
     file.write_text('{"controller": "pi"}')
     with pytest.raises(UsageError, match=r"--agent: mine=.* must be a gains\.json"):
         chosen([], [f"mine={file}"])

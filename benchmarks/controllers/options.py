@@ -94,8 +94,13 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
     """Return the record of a user's own controller at these locations."""
     files = [Path(location) for location in locations]
     suffixes = {file.suffix for file in files}
+    if (".json" in suffixes and len(files) > 1) or (".npz" in suffixes and len(suffixes) > 1):
+        listed = " and ".join(locations)
+        raise UsageError(
+            f"--agent: {name!r} must be one gains.json or several .npz, got {listed}"
+        )
     try:
-        if suffixes == {".json"} and len(files) == 1:
+        if suffixes == {".json"}:
             return _searched(name, files[0])
         if suffixes == {".npz"}:
             return _trained(name, files)
@@ -108,7 +113,7 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
         look=OWN_LOOKS[0],
         build=_make,
         prior_knowledge=(*EVERYTHING, *LIMITS),
-        networks=partial(_found, locations),
+        networks=partial(_load_all, locations),
         random=True,
         pictured=True,
     )
@@ -139,21 +144,21 @@ def _trained(name: str, files: Sequence[Path]) -> ControllerSpec:
 
 
 @dataclass(frozen=True)
-class Own:
-    """What is found at a location."""
+class UserCode:
+    """What a location of `--agent` holds."""
 
     factory: Callable[..., Any]  # returns a policy, or it and the environment that it acts in
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
 
-def _found(locations: Sequence[str]) -> dict[str, Own]:
-    """Return what is found at each location."""
+def _load_all(locations: Sequence[str]) -> dict[str, UserCode]:
+    """Return what each location holds, by location."""
     return {location: _loaded(location) for location in locations}
 
 
-def _loaded(location: str) -> Own:
-    """Return what is found at a location, a module or a zip."""
+def _loaded(location: str) -> UserCode:
+    """Return what a location holds, a module or a zip; `UsageError` if it is faulty."""
     try:
         return _saved(location) if location.endswith(".zip") else _imported(location)
     except (Exception, SystemExit) as error:  # whatever a user's code or file raises
@@ -161,7 +166,7 @@ def _loaded(location: str) -> Own:
         raise UsageError(f"--agent: {text}") from error
 
 
-def _imported(location: str) -> Own:
+def _imported(location: str) -> UserCode:
     """Import a user's factory; the README of `benchmarks.compare` says what it may have."""
     factory: Any = pkgutil.resolve_name(location)
     observation = dict(getattr(factory, "observation", PAPER_WINDOWS))
@@ -169,10 +174,10 @@ def _imported(location: str) -> Own:
         allowed = ", ".join(WINDOWS)
         raise ValueError(f"observation must have names out of {allowed}, got {observation}")
     about = {name: str(getattr(factory, name, "")) for name in ("knows", "searched")}
-    return Own(factory, observation, about)
+    return UserCode(factory, observation, about)
 
 
-def _saved(location: str) -> Own:
+def _saved(location: str) -> UserCode:
     """Load a model, which acts as its file says, or else in the plain environment."""
     import stable_baselines3  # here: PyTorch takes seconds to load
 
@@ -189,10 +194,10 @@ def _saved(location: str) -> Own:
     weights = sum(weight.numel() for weight in model.policy.parameters())
     samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
     about["searched"] = f"{weights:,} weights: {samples}"
-    return Own(lambda: model, provenance=about)
+    return UserCode(lambda: model, provenance=about)
 
 
-def _make(*, network: Own, **known: Any) -> Any:
+def _make(*, network: UserCode, **known: Any) -> Any:
     """Call a user's factory with the arguments that it accepts, by name."""
     accepted = inspect.signature(network.factory).parameters
     takes_all = any(argument.kind is argument.VAR_KEYWORD for argument in accepted.values())
