@@ -48,7 +48,7 @@ def test_help_imports_nothing_heavy():
     assert {"nn-frozen", "square-dead-zone-7"} <= {*re.split(r"[\s,]+", done.stdout)}
 
 
-LOG = ROOT / "benchmarks/identify/example.csv"
+LOG = ROOT / "benchmarks/logs/example.csv"
 REFUSED = {
     "claims": [(["everything"], "no 'everything'")],
     "compare": [
