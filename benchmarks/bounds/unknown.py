@@ -261,7 +261,7 @@ def _intercepts_with_jumps(
     samples = len(changes.counts)
     # The load does not jump within the d + 1 samples, or one of the changes is the first jump.
     parts = [noise]
-    probabilities = [(1.0 - jump) ** changes.counts]
+    probabilities = [((1.0 - jump) ** changes.counts).astype(np.float64)]
     level_effects = [np.zeros(samples)]  # of the level at k - d - 1 on n(k), degC per degC
     fewer = _reduced(noise, JUMP_ATOMS)
     for place, after in enumerate(_after_jumps(changes.effects, amplitude, jump)):
