@@ -24,7 +24,7 @@ Values = NDArray[np.float64]  # one per episode, shape (episodes,)
 
 SEED: Final = 7_000_000  # of the first fixed episode, as the next one has the next seed
 VALIDATION_SEED: Final = 5_000_000  # of the first episode to choose policies by
-VALIDATION_EPISODES: Final = 200
+VALIDATION_EPISODES: Final = 200  # with bounds, never published as a result
 EPISODES: Final = 100
 SAMPLES: Final = 1200  # of an episode, unless its environment ends it earlier
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"

@@ -14,7 +14,7 @@ from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.least import least_possible
 from benchmarks.bounds.linear_program import equations, plan, reference, response
-from benchmarks.bounds.unknown import noise_variance, unknown
+from benchmarks.bounds.unknown import load_changes, noise_variance, unknown
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
@@ -25,6 +25,9 @@ from mptc_gym.plant import action_from_command
 from tests.verify_bounds import CONTROLLERS, beats, errors
 
 CALM = Parameters()
+
+
+SHARES = np.linspace(0.0, 1.0, 21)
 
 
 def run_mpc(runs, samples, seed=0, **arguments):
@@ -176,31 +179,48 @@ class TestUnknown:
             "disturbance_walk_variance": 0.02,
         }  # fmt: skip
         bound = unknown(course_of(620, noise_variance=R, **load))
-        draws, p = 40_000, 0.4
-        old = rng.uniform(-3.0, 3.0, draws)  # the level at the last sample that can be known
-        jumps = {i: rng.random(draws) < p for i in range(k - 18, k + 1) if i % 10 == 0}
-        last = np.max([np.where(now, i, 0) for i, now in jumps.items()], axis=0)
-        level, mean, walk, xi = old, old, np.zeros(draws), np.zeros((3, draws))
-        # What no controller foresees, and what is left if all but the last level is told.
-        y, told = np.zeros((2, 3, draws))
+        draws, jump = 40_000, 0.4
+        known = rng.uniform(-3.0, 3.0, draws)  # the level at k - d - 1
+        level, walk, xi = known, np.zeros(draws), np.zeros((3, draws))
+        jumps = {i: rng.random(draws) < jump for i in range(k - 18, k + 1) if i % 10 == 0}
+        last_jump = np.max([np.where(jumped, i, 0) for i, jumped in jumps.items()], axis=0)
+        # What happens to y(k), beyond what it does if the load stays; and what is left of that
+        # if the times of the jumps are known, too, and all levels but the last.
+        unforeseen, level_alone = np.zeros((2, 3, draws))
         for i in range(k - 18, k + 1):
             if i in jumps:
                 level = np.where(jumps[i], rng.uniform(-3.0, 3.0, draws), level)
-                mean = (1 - p) * mean
                 walk = walk + rng.uniform(-1, 1, draws) * np.sqrt(3 * 10 * 0.02)
             xi = np.vstack([np.sqrt(R) * rng.standard_normal(draws), xi[:2]])
             noise = np.dot(CALM.c, xi) + sum(CALM.a) * walk
-            after = (last > 0) & (i >= last)
-            for out, surprise in ((y, level - mean), (told, np.where(after, level, 0.0))):
-                out[1:] = out[:-1].copy()
-                out[0] = noise + sum(CALM.a) * surprise
-                out[0] -= CALM.a[1] * out[1] + CALM.a[2] * out[2]
-        least = bound.mean_error(np.zeros(620))[k]
-        assert 0.96 < least / np.abs(told[0]).mean() < 1.01  # slices make it a little smaller
-        for m in (0.0, 0.4, 1.5):
+            after = (last_jump > 0) & (i >= last_jump)
+            for y, of_load in (
+                (unforeseen, level - known),
+                (level_alone, np.where(after, level, 0.0)),
+            ):
+                y[1:] = y[:-1].copy()
+                y[0] = noise + sum(CALM.a) * of_load
+                y[0] -= CALM.a[1] * y[1] + CALM.a[2] * y[2]
+        for m in (0.0, 0.4, 1.5):  # whatever the level: no better than the bound
             least = bound.mean_error(np.full(620, m))[k]
-            found = np.abs(m - y[0])
-            assert least < found.mean() + 3 * found.std() / np.sqrt(draws)
+            errors_if_m = np.abs(m - unforeseen[0])
+            assert least < errors_if_m.mean() + 3 * errors_if_m.std() / np.sqrt(draws)
+        # With an error of 0 in the mean, the best forecast is a share of the known level.
+        least = bound.mean_error(np.zeros(620))[k]
+        forecasts = [np.abs(share * known + unforeseen[0]).mean() for share in SHARES]
+        assert 0.97 < least / min(forecasts) < 1.005
+        # A controller that knew when the load jumps could come below the bound.
+        assert np.abs(level_alone[0]).mean() < 0.97 * least
+
+    def test_the_load_by_hand_where_it_jumps_at_every_change(self):
+        # The two new levels U and V within d + 1 samples add a U + b V, whose mean absolute
+        # value for b <= a is a / 2 + b^2 / (6 a). The level before them can be made up for.
+        model = course_of(620, disturbance_amplitude=3.0, disturbance_interval=10.0)
+        latest, earlier = load_changes(model).effects[600:].T
+        a, b = np.sort([3.0 * latest, 3.0 * np.maximum(earlier - latest, 0.0)], axis=0)[::-1]
+        found = unknown(model).intercepts[600:, 0]
+        assert np.all(found <= a / 2 + b**2 / (6 * a) + 1e-12)
+        assert np.all(found >= 0.98 * (a / 2 + b**2 / (6 * a)))
 
 
 class TestCausal:
@@ -267,7 +287,7 @@ class TestLeastPossible:
             "samples must be an integer": {"samples": 0},
             "episodes must be an integer": {"episodes": 0},
             "kind must be one of": {"kind": "best"},
-            "preview, reference for the set point 'square', got 'causal'": {"kind": "causal"},
+            "set point 'square' has no law, got 'causal'": {"kind": "causal"},
             "delay must be": {"delay": -1},
             "must be held until": {"kind": "reference", "setpoint_period": 100},
         }.items():

@@ -2,8 +2,6 @@
 
 import shutil
 import textwrap
-from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -14,18 +12,28 @@ from benchmarks.lib.provenance import ROOT, commit, versions
 from benchmarks.lib.storage import write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions, Scenario
 from mptc_gym import PRESETS
-from mptc_gym.evaluation import EPISODES, SAMPLES, SEED
+from mptc_gym.evaluation import (
+    EPISODES,
+    SAMPLES,
+    SEED,
+    VALIDATION_EPISODES,
+    VALIDATION_SEED,
+)
 
 HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
+HIDDEN = "hidden load (estimate)"
 NOTE = (
     "With preview: no controller does better on average, even one that knows the set point "
     "beforehand. Without: none that learns of a change of the set point when it happens; for "
     "random set points alone, which have a law. Reference: the same, if each change finds the "
     "plant settled; a controller that counts samples can come below it. Where a set point "
-    "never changes, the three are the same. 95 % intervals over drawn episodes."
+    "never changes, the three are the same. All of them know the load as soon as it changes. "
+    "Hidden load: an estimate, not a bound, for controllers that see the load through the "
+    "transmitter alone, from the reference or, for random set points, from the bound without "
+    "preview. 95 % intervals over drawn episodes."
 )
 PACKAGE = ROOT / "mptc_gym" / "bounds.json"
-MORE = 20  # episodes of the package beyond those of a score, for choosing policies
+MORE = 20  # episodes of the package beyond those of a score, which `ScoreCallback` runs
 PACKAGED = PRESETS | {
     f"{name}, random set points": {**PRESETS[name], "setpoint": "random"}
     for name in ("paper", "disturbed", "fouling")  # for the data sets
@@ -59,63 +67,105 @@ def work(options: Options) -> str:
     cases = options.plant.cases(SCENARIOS | PRESET_SCENARIOS)
     if options.package:
         return write_package(options.fan_out)
-    drawn = {"episodes": options.episodes, "seed": options.seed}
-    tasks = {
-        name: partial(row, case, options.samples or case.samples, drawn, options.mpc)
-        for name, case in cases.items()
-    }
+    tasks = {name: partial(row, case, options) for name, case in cases.items()}
+    headings = ["no control", *HEADINGS.values(), HIDDEN]
+    if options.mpc:
+        headings.append("MPC")
     print(", ".join(filter(None, ["Mean |e| in °C", options.plant.name])) + ":")
-    found = {"": ["no control", *HEADINGS.values(), *["MPC"] * bool(options.mpc)]}
+    rows: dict[str, list[str]] = {}
     try:
-        found.update(options.fan_out.stream(tasks, "bounds"))
+        rows.update(options.fan_out.stream(tasks, "bounds"))
     finally:
-        for name in [each for each in ("", *tasks) if each in found]:
-            cells = "".join(f"{cell:>26}" for cell in found[name])
-            print(f"{name:20}{cells}".rstrip(), flush=True)
+        _print_row("", headings)
+        for name in tasks:
+            if name in rows:
+                _print_row(name, rows[name])
     return "\n" + textwrap.fill(NOTE, shutil.get_terminal_size((150, 24)).columns)
 
 
-def row(case: Scenario, samples: int, drawn: Mapping[str, Any], mpc: int | None) -> list[str]:
-    """Return the bounds of a case, and the error of `mpc` runs of MPC, if any.
+def _print_row(name: str, cells: list[str]) -> None:
+    columns = "".join(f"{cell:>26}" for cell in cells)
+    print(f"{name:20}{columns}".rstrip(), flush=True)
 
-    `drawn` holds the number and first seed of the episodes.
+
+def row(case: Scenario, options: Options) -> list[str]:
+    """Return the errors of a case as text, in the order of the headings.
+
+    A cell is empty if the case has no bound of its kind, or no load to estimate.
     """
-    from benchmarks.bounds.least import least_possible
+    from benchmarks.bounds.least import least_possible, with_hidden_load
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.lib.statistics import bootstrap
     from benchmarks.loop.rollout import mean_error
 
-    least = partial(least_possible, samples=samples, **drawn, **case.arguments)
-    cells = [f"{least(kind='preview').idle:.4f}"]
-    for kind in HEADINGS:
+    samples = options.samples or case.samples
+    arguments: dict[str, Any] = {
+        "samples": samples,
+        "episodes": options.episodes,
+        "seed": options.seed,
+        **case.arguments,
+    }
+    cells = [f"{least_possible(kind='preview', **arguments).idle:.4f}"]
+    cells += [_bound(kind, arguments) for kind in HEADINGS]
+    if case.parameters.is_disturbed:
+        cells.append(f"{with_hidden_load(**arguments):.4f}")
+    else:
         cells.append("")
-        # "causal" needs random set points, "reference" those that are held long enough.
-        with suppress(NoBoundError):
-            cells[-1] = f"{least(kind=kind):.4f}"
-    if mpc:
-        runs = ROSTER["mpc"].run(case.arguments, samples, mpc, drawn["seed"])
+    if options.mpc:
+        runs = ROSTER["mpc"].run(case.arguments, samples, options.mpc, options.seed)
         cells.append(f"{bootstrap(mean_error(runs), seed=0):.4f}")
     return cells
 
 
-def write_package(fan_out: FanOut) -> str:
-    """Write the least possible error of each case, for every episode where they differ."""
+def _bound(kind: str, arguments: dict[str, Any]) -> str:
+    """Return a bound as text, empty if the case has none of this kind."""
     from benchmarks.bounds.least import least_possible
 
-    case: dict[str, Any] = {"samples": SAMPLES, "seed": SEED, "episodes": EPISODES + MORE}
-    tasks = {name: partial(least_possible, **case, **each) for name, each in PACKAGED.items()}
-    found = dict(fan_out.stream(tasks, "bounds"))
-    about = {
+    try:
+        return f"{least_possible(kind=kind, **arguments):.4f}"
+    except NoBoundError:
+        return ""
+
+
+def write_package(fan_out: FanOut) -> str:
+    """Write the least possible error of each case, for every episode where they differ.
+
+    Each case has the bounds of the published episodes, "least". Where bounds differ, it also
+    has those of the episodes to choose policies by, "validation_least".
+    """
+    from benchmarks.bounds.least import least_possible
+
+    published: dict[str, Any] = {"seed": SEED, "episodes": EPISODES + MORE}
+    validation: dict[str, Any] = {"seed": VALIDATION_SEED, "episodes": VALIDATION_EPISODES}
+    tasks = {
+        name: partial(least_possible, samples=SAMPLES, **published, **arguments)
+        for name, arguments in PACKAGED.items()
+    }
+    bounds = dict(fan_out.stream(tasks, "bounds"))
+    tasks = {
+        name: partial(least_possible, samples=SAMPLES, **validation, **PACKAGED[name])
+        for name, least in bounds.items()
+        if len(least.episodes) > 1
+    }
+    validation_bounds = dict(fan_out.stream(tasks, "validation bounds"))
+    cases: dict[str, dict[str, Any]] = {}
+    for name, arguments in PACKAGED.items():
+        least = bounds[name]
+        cases[name] = {"arguments": arguments, "kind": least.kind, "least": least.episodes}
+        if name in validation_bounds:
+            cases[name]["validation_least"] = validation_bounds[name].episodes
+    content = {
         "command": "python -m benchmarks.bounds --package",
         "commit": commit(),
         "versions": versions(),
         "unit": "degC, mean of |e(k)| over k = 1 to samples",
+        "samples": SAMPLES,
+        **published,
+        "validation_seed": VALIDATION_SEED,
+        "validation_episodes": VALIDATION_EPISODES,
+        "cases": cases,
     }
-    cases = {
-        name: {"arguments": arguments, "kind": found[name].kind, "least": found[name].episodes}
-        for name, arguments in PACKAGED.items()
-    }
-    write_json(PACKAGE, {**about, **case, "cases": cases})
+    write_json(PACKAGE, content)
     return f"Written to {PACKAGE}"
 
 

@@ -1,9 +1,8 @@
 """Solve the linear program behind every bound, and plan the flow of a reference."""
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # loads its modules on first use
@@ -16,14 +15,20 @@ from benchmarks.loop.rollout import held
 Array = NDArray[np.float64]
 
 NOTHING = 1e-9  # fraction of the largest response below which a response is left out
-SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)  # method, and presolve
-TIME_LIMIT = 30.0  # s for each attempt
+# Method, and whether HiGHS simplifies the program first, which fails for a few plants.
+SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)
+TIME_LIMIT = 30.0  # s for each attempt; most programs take less than 1 s
 
 # For a reference.
 SETTLED = 0.05  # fraction of the flow's range that a settled flow may move within the lag
-TAIL = 60  # samples that a plan looks beyond the end of a hold, in addition to the lag
-LEVEL = 0.001  # least slope of the error in plans, so that they end at the set point
-SMOOTH = 1e-4  # price per t/h of travel, which selects the quietest of equal plans
+# Samples that a plan looks beyond the end of a hold, in addition to the lag: with more, the
+# references of the presets are the same.
+TAIL = 60
+# Two prices far below that of an error, which is 1, select among equally good plans: the least
+# slope of the error makes them end at the set point, the price of travel, per t/h, keeps the
+# valve quiet.
+LEVEL = 0.001
+SMOOTH = 1e-4
 
 
 @dataclass(frozen=True)
@@ -55,14 +60,15 @@ class Unknown:
 def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
     """Return A and B of (28) without noise, A y = B u, for an episode from rest."""
     lags = 1, int(model.numbers.delay) + 1
-    below, B = (
+    past_outputs, past_flows = (
         # Row k has coefficients[k, i] in column k - lag - i.
         scipy.sparse.dia_array(
-            (each[:samples].T, lag + np.arange(each.shape[1])), shape=(samples, samples)
+            (coefficients[:samples].T, lag + np.arange(coefficients.shape[1])),
+            shape=(samples, samples),
         ).T.tocsr()
-        for each, lag in zip((model.alpha, model.beta), lags, strict=True)
+        for coefficients, lag in zip((model.alpha, model.beta), lags, strict=True)
     )
-    return (scipy.sparse.eye_array(samples) - below).tocsr(), B
+    return (scipy.sparse.eye_array(samples) - past_outputs).tocsr(), past_flows
 
 
 def response(A: Any, B: Any) -> Array:
@@ -107,74 +113,135 @@ def plan(
         # The bound of E|m - n| may be level near 0, where a quiet plan needs a slope.
         slopes = np.maximum(unknown.slopes, LEVEL if quiet else 0.0)
         lengths = np.repeat(unknown.lengths[start + 1 : samples], 2, axis=1).T.ravel()
-        unknowns = [
-            _unknowns(n, 0.0, -np.inf, np.inf),
-            _unknowns(n, price[start:-1], *model.limits),
-            _unknowns(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
-            _unknowns(2 * n * quiet, SMOOTH, 0.0, np.inf),
-        ]
         targets = np.zeros(n + n * quiet)
         targets[:n] = (setpoint - idle)[start + 1 :]
         targets[n : n + 1] = flow[start - 1]  # which the moves start from: 0 at the beginning
-        own = A[start + 1 :, start + 1 :], B[start + 1 :, start:-1]
-        flow[start:-1] = _solve(*own, targets, unknowns, np.roots(model.parameters.b))
+        program = _Program(
+            A=A[start + 1 :, start + 1 :],
+            B=B[start + 1 :, start:-1],
+            targets=targets,
+            outputs=_Variables.of(n, 0.0, -np.inf, np.inf),
+            flows=_Variables.of(n, price[start:-1], *model.limits),
+            pieces=_Variables.of(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
+            moves=_Variables.of(2 * n * quiet, SMOOTH, 0.0, np.inf),
+        )
+        flow[start:-1] = _solve(program, zeros=np.roots(model.parameters.b))
     # The last flow affects no output; if it does not move, it costs nothing either.
     flow[-1] = flow[-2] if samples > 1 else 0.0
     output = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
     return unknown.mean_error(setpoint - output), flow
 
 
-def _unknowns(count: int, cost: Any, low: Any, high: Any) -> Array:
-    return np.column_stack([np.broadcast_to(each, count) for each in (cost, low, high)])
+class _Variables(NamedTuple):
+    """Variables of a linear program, each array of shape (variables,)."""
+
+    cost: Array
+    low: Array
+    high: Array
+
+    @classmethod
+    def of(cls, count: int, cost: Any, low: Any, high: Any) -> "_Variables":
+        """Return `count` variables, whose costs and ends are arrays or hold for all."""
+        return cls(*(np.broadcast_to(values, count) for values in (cost, low, high)))
 
 
-def _solve(
-    A: Any, B: Any, targets: Array, unknowns: Sequence[Array], zeros: NDArray[Any]
-) -> Array:
-    """Return the flows of the least cost.
+class _Program(NamedTuple):
+    """The linear program of `plan` over n samples.
 
-    The unknowns, each with its cost and ends, are y, u, the pieces of E|m - n| for m above and
-    below 0, and the moves up and down of a quiet plan. `zeros` are those of B.
+    The outputs y and the flows u obey A y = B u. Each target is a sum: the first n, set points
+    without the effect of past flows, are an output plus the pieces of m above 0 minus those
+    below 0. In a quiet plan n further targets are a move of the flow minus the moves up plus
+    the moves down.
     """
-    n, rows = A.shape[0], len(targets)
-    eye = scipy.sparse.eye_array(n)
-    pieces = scipy.sparse.hstack([eye, -eye] * (len(unknowns[2]) // (2 * n)))
-    if rows > n:
-        pieces = scipy.sparse.block_diag([pieces, scipy.sparse.hstack([-eye, eye])])
-    # The first n targets are y and its pieces, the others the moves of u and theirs.
-    of_output = scipy.sparse.eye_array(rows, n)
-    moves = eye - scipy.sparse.eye_array(n, k=-1)
-    of_flow = scipy.sparse.eye_array(rows, n, k=-n, format="csr") @ moves
 
-    # With outputs among the unknowns the program is sparse, and fast where A is slow. But if
+    A: Any  # sparse, shape (n, n)
+    B: Any  # sparse, shape (n, n)
+    targets: Array  # shape (n,), or (2 n,) of a quiet plan
+    outputs: _Variables  # degC
+    flows: _Variables  # t/h
+    pieces: _Variables  # of m, degC: for each slope n above 0 and n below
+    moves: _Variables  # of a quiet plan, t/h: n up and n down
+
+
+class _Form(NamedTuple):
+    """A program as solvers take it: `matrix` times all variables is `right`."""
+
+    matrix: Any  # sparse, shape (equations, variables)
+    right: Array  # shape (equations,)
+    variables: Sequence[_Variables]
+    first_flow: int  # place of the first flow among the variables
+
+
+def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
+    """Return the flows of the least cost, t/h, shape (n,). `zeros` are those of B in (28)."""
+    forms = [_with_outputs, _with_flows_alone]
+    # With outputs among the variables the program is sparse, and fast where A is slow. But if
     # a zero of B lies outside the unit circle, the flow that gives an output grows without
     # bound: solvers that vary outputs freely fail, or end away from the optimum.
-    orders = sorted([False, True], reverse=bool(np.any(np.abs(zeros) > 1.0)))
-    attempts = list(itertools.product(orders, SOLVERS))
-    for flows_alone, (method, presolve) in attempts:
-        blocks: Any = [[A, -B, None], [of_output, of_flow, pieces]]
-        right, columns = np.concatenate([np.zeros(n), targets]), unknowns
-        if flows_alone:  # each output is the sum of the effects of the flows
-            G = response(A, B)
-            G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
-            blocks = [[of_output @ scipy.sparse.csr_array(G) + of_flow, pieces]]
-            right, columns = targets, unknowns[1:]
-        costs_and_ends = np.concatenate(columns)
-        solved = scipy.optimize.linprog(
-            costs_and_ends[:, 0],
-            A_eq=scipy.sparse.block_array(blocks).tocsc(),
-            b_eq=right,
-            bounds=costs_and_ends[:, 1:],
-            method=method,
-            options={"time_limit": TIME_LIMIT, "presolve": presolve},
-        )
-        if solved.success:
-            flows: Array = solved.x[:n] if flows_alone else solved.x[n : 2 * n]
-            return flows
+    if np.any(np.abs(zeros) > 1.0):
+        forms.reverse()
+    for make_form in forms:
+        form = make_form(program)
+        cost, low, high = np.hstack(form.variables)
+        for method, presolve in SOLVERS:
+            solution = scipy.optimize.linprog(
+                cost,
+                A_eq=form.matrix,
+                b_eq=form.right,
+                bounds=np.column_stack([low, high]),
+                method=method,
+                options={"time_limit": TIME_LIMIT, "presolve": presolve},
+            )
+            if solution.success:
+                end = form.first_flow + len(program.flows.cost)
+                flows: Array = solution.x[form.first_flow : end]
+                return flows
     raise RuntimeError(
-        f"the linear program of {n} samples was not solved in any of {len(attempts)} ways: "
-        f"{solved.message}"
+        f"the linear program of {program.A.shape[0]} samples was not solved in any of "
+        f"{len(forms) * len(SOLVERS)} ways: {solution.message}"
     )
+
+
+def _with_outputs(program: _Program) -> _Form:
+    """Return the form in which the outputs are variables."""
+    n = program.A.shape[0]
+    of_outputs, of_flows, of_pieces = _target_matrices(program)
+    blocks: Any = [[program.A, -program.B, None], [of_outputs, of_flows, of_pieces]]
+    return _Form(
+        matrix=scipy.sparse.block_array(blocks).tocsc(),
+        right=np.concatenate([np.zeros(n), program.targets]),
+        variables=[program.outputs, program.flows, program.pieces, program.moves],
+        first_flow=n,
+    )
+
+
+def _with_flows_alone(program: _Program) -> _Form:
+    """Return the form in which each output is the sum of the effects of the flows."""
+    of_outputs, of_flows, of_pieces = _target_matrices(program)
+    G = response(program.A, program.B)
+    G[np.abs(G) < NOTHING * np.abs(G).max(initial=0.0)] = 0.0
+    blocks: Any = [[of_outputs @ scipy.sparse.csr_array(G) + of_flows, of_pieces]]
+    return _Form(
+        matrix=scipy.sparse.block_array(blocks).tocsc(),
+        right=program.targets,
+        variables=[program.flows, program.pieces, program.moves],
+        first_flow=0,
+    )
+
+
+def _target_matrices(program: _Program) -> tuple[Any, Any, Any]:
+    """Return what outputs, flows, and pieces with moves contribute to the targets."""
+    n = program.A.shape[0]
+    rows = len(program.targets)
+    eye = scipy.sparse.eye_array(n)
+    slopes = len(program.pieces.cost) // (2 * n)
+    of_pieces = scipy.sparse.hstack([eye, -eye] * slopes)
+    if len(program.moves.cost):
+        of_pieces = scipy.sparse.block_diag([of_pieces, scipy.sparse.hstack([-eye, eye])])
+    of_outputs = scipy.sparse.eye_array(rows, n)
+    differences = eye - scipy.sparse.eye_array(n, k=-1)
+    of_flows = scipy.sparse.eye_array(rows, n, k=-n, format="csr") @ differences
+    return of_outputs, of_flows, of_pieces
 
 
 def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> tuple[Array, Array]:
@@ -195,8 +262,8 @@ def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> tuple[Ar
         last = stop == len(setpoint)
         beyond = np.full(0 if last else model.lag + TAIL, setpoint[start])
         ahead = np.concatenate([setpoint[:stop], beyond])
-        of_hold, flow = plan(model, unknown, ahead, past=flow[:start], quiet=True)
-        error[start:stop] = of_hold[start:stop]
+        error_of_hold, flow = plan(model, unknown, ahead, past=flow[:start], quiet=True)
+        error[start:stop] = error_of_hold[start:stop]
         moving = np.ptp(flow[max(stop - model.lag - 1, start - 1, 0) : stop])
         if not last and (stop - start < model.lag or moving > SETTLED * (high - low)):
             raise NoBoundError(

@@ -6,11 +6,13 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from benchmarks.compare.anticipation import Anticipation, anticipation
 from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.report import Section, write_report
@@ -26,6 +28,16 @@ SCORE = "Mean over the cases, 95 % interval; travel of the valve in the median r
 BOUND = (
     "Least possible without foresight; where marked *, if each change of the set point finds "
     "the plant settled. A controller that knows the timetable can be between the two."
+)
+ANTICIPATES = (
+    "‡ moves before the square wave changes, so its score in this case is that of runs with "
+    "the same seeds in which nobody can foresee the changes."
+)
+SURPRISED = (
+    "These controllers move before the square wave changes, by the share of the change that is "
+    "given. On the published square wave any controller that knows its period can reach the "
+    "error with foresight. Where levels hold for times that nobody can foresee, the error is "
+    "compared with the least possible there."
 )
 PAIRED = "Below 0 a controller is better; in % the share of runs in which it is."
 ROBUST = (
@@ -52,6 +64,7 @@ class Case:
     responses: pd.DataFrame  # percentiles over the runs, a row for each sample
     policies: Sequence[Mapping[str, Any]]  # origins of the members that were trained
     seconds: float  # processor time of the runs
+    anticipation: Anticipation | None = None  # if it moves before a square wave changes
 
 
 def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: int) -> Case:
@@ -69,13 +82,15 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
         measures = measure(trajectory, scenario.parameters)
         rows = {name: np.broadcast_to(values, runs) for name, values in measures.items()}
         tables.append(pd.DataFrame({**about, "seed": range(seed, seed + runs), **rows}))
+    seconds = time.process_time() - began
     return Case(
         scenario.name,
         controller.name,
         pd.concat(tables, ignore_index=True),
         _responses(trajectories, scenario, controller.name),
         [dict(each.provenance) for each in members if each.provenance],
-        time.process_time() - began,
+        seconds,
+        anticipation(scenario, members, trajectories, runs, seed),
     )
 
 
@@ -121,13 +136,18 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     return Scale(scenario, least, preview.value)
 
 
-def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
+def estimate(
+    runs: pd.DataFrame,
+    scales: Mapping[str, Scale],
+    anticipations: Mapping[tuple[str, str], Anticipation] = MappingProxyType({}),
+) -> pd.DataFrame:
     """Return estimates with 95 % intervals, one row for each case and agent.
 
     They are the `mean` of |e|, degC; `ratio`, the mean as a multiple of `limit`, the least
     possible error; `difference`, the mean paired difference from the first agent; and
     `improvement`, the probability of doing better than that agent, where ties count half.
-    `preview` is the least possible error with foresight, `scores` those of the runs, an array.
+    `preview` is the least possible error with foresight, `scores` those of the runs, an array:
+    of surprising ones, with a `mark`, if `anticipations` has the case and the agent.
     Ends are infinite if runs differ but there is only one.
     """
     reference, rows = runs["agent"].iloc[0], []
@@ -144,7 +164,9 @@ def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
                 mean = replace(mean, low=-math.inf, high=math.inf)
             row = {"scenario": name, "agent": agent, "limit": limit, "preview": scale.preview}
             row |= {"mean": mean, "ratio": mean.scaled(1 / limit)}
-            row["scores"] = scale.least.score(errors)
+            row |= {"scores": scale.least.score(errors), "mark": ""}
+            if (name, agent) in anticipations:
+                row |= {"scores": anticipations[name, agent].scores, "mark": "‡"}
             if base is not None and agent != reference:
                 row["difference"] = bootstrap(errors - base, seed=BOOTSTRAP)
                 better = (errors < base) + 0.5 * (errors == base)
@@ -214,11 +236,16 @@ def write(
     runs = runs[runs["scenario"].isin([*scales])]
     if runs.empty:
         return
-    estimates = estimate(runs, scales)
+    anticipations = {
+        (case.scenario, case.agent): case.anticipation
+        for case in cases
+        if case.anticipation is not None
+    }
+    estimates = estimate(runs, scales, anticipations)
     plants = [scale.scenario.parameters for scale in scales.values()]
     misfits = misfits_of(controllers, plants)
     scores = ranked(estimates, misfits)
-    write_numbers(folder / "estimates.csv", estimates.drop(columns="scores"))
+    write_numbers(folder / "estimates.csv", estimates.drop(columns=["scores", "mark"]))
     errors = runs.groupby(["scenario", "agent"])["mae"].mean()
     pictured = [
         name for name, spec in controllers.items() if spec.pictured and name not in misfits
@@ -234,7 +261,9 @@ def write(
         few = responses[name][responses[name]["agent"].isin(pictured)]
         rows, path = responses[name] if few.empty else few, folder / f"{name}.png"
         plots.plot_responses(rows, errors[name], scale.scenario, path)
-    sections = report(runs, estimates, scores, scales, cases, controllers, misfits)
+    sections = report(
+        runs, estimates, scores, scales, cases, controllers, misfits, anticipations
+    )
     write_report(folder, "Comparison of controllers", sections, made, printed=2)
 
 
@@ -263,6 +292,7 @@ def report(
     cases: Sequence[Case],
     controllers: Mapping[str, ControllerSpec],
     misfits: Mapping[str, str],
+    anticipations: Mapping[tuple[str, str], Anticipation],
 ) -> list[Section]:
     """Return the sections of the report that have anything to show."""
     reference = str(runs["agent"].iloc[0])
@@ -271,6 +301,8 @@ def report(
         f"{MARK} Not ranked, as its error here is no result: {reason}"
         for reason in misfits.values()
     ]
+    if anticipations:
+        notes.add(ANTICIPATES)
     paired = difference_table(estimates)
     parts = runs[runs["scenario"] == "hard"].groupby("agent")[[*PARTS]].mean()
     parts = parts.sort_values("mae").map("{:.3f}".format).rename(index=label, columns=PARTS)
@@ -289,6 +321,11 @@ def report(
             "Mean error as a multiple of the least possible, with its 95 % interval",
             [BOUND],
             ratio_table(estimates, scales, [*scores]),
+        ),
+        Section(
+            "Anticipation: who moves before the square wave changes",
+            [SURPRISED],
+            anticipation_table(anticipations, estimates),
         ),
         Section(f"Difference to {label(reference)} (°C), 95 % interval", [PAIRED], paired),
         Section(
@@ -314,6 +351,30 @@ def report(
     return [each for each in sections if each.table is None or len(each.table)]
 
 
+def anticipation_table(
+    anticipations: Mapping[tuple[str, str], Anticipation], estimates: pd.DataFrame
+) -> pd.DataFrame:
+    """Return what controllers gain that move before a square wave changes, a row for each."""
+    rows = []
+    for row in estimates.to_dict("records"):
+        found = anticipations.get((row["scenario"], row["agent"]))
+        if found is None:
+            continue
+        rows.append(
+            {
+                "case": row["scenario"],
+                "controller": label(row["agent"]),
+                "moved before the change (%)": f"{found.movement.scaled(100.0):.0f}",
+                "mean error (°C)": f"{row['mean'].value:.3f}",
+                "without foresight": f"{row['limit']:.3f}",
+                "with foresight": f"{row['preview']:.3f}",
+                "multiple": f"{row['ratio'].value:.2f}",
+                "multiple where changes surprise": f"{found.ratio:.2f}",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
 def score_table(
     runs: pd.DataFrame,
     estimates: pd.DataFrame,
@@ -324,7 +385,8 @@ def score_table(
 
     Controllers in `misfits` have no score.
     """
-    cells = estimates["scores"].map(lambda each: written(each.mean(), ".2f"))
+    cells = estimates["scores"].map(lambda scores: written(scores.mean(), ".2f"))
+    cells += estimates["mark"]
     table = _by_agent(estimates, cells, [*scores])
     travels = runs.groupby(["agent", "scenario"])["total_variation"].median()
     overall = [f"{score:.3f}" for score in scores.values()]
@@ -344,7 +406,8 @@ def ratio_table(
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")
         bounds[name] = [f"{scale.least.value:.3f}{mark}", f"{scale.preview:.3f}"]
-    table = _by_agent(estimates, estimates["ratio"].map("{:.2f}".format), agents)
+    cells = estimates["ratio"].map("{:.2f}".format) + estimates["mark"]
+    table = _by_agent(estimates, cells, agents)
     return pd.concat([bounds, table], ignore_index=True)
 
 

@@ -4,6 +4,7 @@ It shows how close a controller can come to the bounds of `benchmarks.bounds`.
 """
 
 import numpy as np
+import scipy  # loads its modules on first use
 from numpy.typing import NDArray
 
 from agents.actuator import applied_flow, float32_action
@@ -11,13 +12,67 @@ from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
 from mptc_gym.plant import DRIFT_INTERVAL
-from mptc_gym.signals import LOAD_INTERVAL
+from mptc_gym.signals import LOAD_INTERVAL, Levels
 
 Array = NDArray[np.float64]
 
 HORIZON = 5  # planned commands; the first is applied, then all are planned again
 SWEEPS, TOLERANCE = 100, 1e-4  # of coordinate descent: most sweeps, and t/h to stop at
 TINY = 1e-9  # degC^2, added to the variance of xi so that the filter trusts the readings
+BISECTIONS = 20  # of a hedged set point: to a millionth of the range of levels
+WARM_UP = 200  # samples until the covariance of the filter hardly changes
+
+
+def probability_held(
+    age: NDArray[np.intp], ahead: NDArray[np.intp], shortest: int, longest: int
+) -> Array:
+    """Return the probability that a random level still holds `ahead` samples later.
+
+    A level holds for a number of samples that is uniform from `shortest` to `longest`. It began
+    `age` samples ago. All arguments broadcast together.
+    """
+    longer = np.clip((longest - age - ahead) / (longest - shortest + 1), 0.0, 1.0)
+    until_now = np.clip((longest - age) / (longest - shortest + 1), TINY, 1.0)
+    return np.asarray(longer / until_now)
+
+
+def hedged_setpoints(setpoint: Array, held: Array, amplitude: float, deviation: Array) -> Array:
+    """Return the outputs to aim at while the set point may change on the way, degC.
+
+    A flow shows only after the delay. By then the set point is still `setpoint` with the
+    probability `held`, otherwise it is a new level, uniform within +-`amplitude`, degC. Let the
+    output be r + n, where n is normal with the standard deviation `deviation`, degC. The r that
+    minimises E|y_d - r - n| is the median of y_d - n:
+
+        held Phi((r - setpoint) / deviation) + (1 - held) G(r) = 1/2.
+
+    G(r) is the mean of Phi((r - x) / deviation) over all levels x: with the integral of Phi,
+    I(z) = z Phi(z) + phi(z),
+
+        G(r) = deviation (I((r + amplitude) / deviation) - I((r - amplitude) / deviation))
+               / (2 amplitude).
+
+    The left side rises with r, so bisection finds it. All arguments broadcast together.
+    """
+    deviation = np.maximum(deviation, TINY)  # without noise the normal law becomes a step
+    shape = np.broadcast_shapes(*map(np.shape, (setpoint, held, deviation)))
+    low, high = np.full(shape, -amplitude), np.full(shape, amplitude)
+    for _ in range(BISECTIONS):
+        r = (low + high) / 2.0
+        below_level = scipy.special.ndtr((r - setpoint) / deviation)
+        upper = _integral_of_phi((r + amplitude) / deviation)
+        lower = _integral_of_phi((r - amplitude) / deviation)
+        below_next = deviation * (upper - lower) / (2.0 * amplitude)
+        too_low = held * below_level + (1.0 - held) * below_next < 0.5
+        low = np.where(too_low, r, low)
+        high = np.where(too_low, high, r)
+    return np.asarray((low + high) / 2.0)
+
+
+def _integral_of_phi(z: Array) -> Array:
+    """Return the integral of the standard normal distribution function up to z."""
+    density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
+    return np.asarray(z * scipy.special.ndtr(z) + density)
 
 
 class PredictiveController:
@@ -26,10 +81,15 @@ class PredictiveController:
     The controller knows A, B, C and d of the plant (28), even where loop i draws them with seed
     `seed + i`, and the course of their drift. A Kalman filter estimates the output, xi and the
     load from the transmitter's readings; for the jumps of the load, which are not normal, it is
-    the best linear filter. The plan minimises the sum of squared errors over the samples that
-    its commands reach first, for a constant set point and inputs within the limits. A first
-    input inside the dead zone is replaced by 0 or by the input at a command on the edge,
-    whichever gives the better plan.
+    the best linear filter. The score is the mean of |e|, so the expected outputs are medians:
+    the load is expected to stay as it is. The plan minimises the sum of squared differences
+    between these and the outputs to aim at, over the samples that its commands reach first, for
+    inputs within the limits. A first input inside the dead zone is replaced by 0 or by the
+    input at a command on the edge, whichever gives the better plan.
+
+    The outputs to aim at are the set point, as if it held for ever. Random set points have a
+    law, which tells from the age of a level how likely it is to change before a command shows:
+    see `hedged_setpoints`.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:
@@ -54,8 +114,11 @@ class PredictiveController:
         ahead = np.arange(int(self._delay.max()) + HORIZON + 1)[:, np.newaxis]
         lag = np.arange(len(parameters.b)) + 1
         self._shows = (self._delay[:, np.newaxis, np.newaxis] + lag - ahead).clip(0)
-        self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON)
+        self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON, dtype=np.intp)
         self._models: dict[int, tuple[LinearModel, Array, Array]] = {}  # by age, samples
+        self._levels = Levels(parameters)
+        if self._levels.random:
+            self._deviation = self._forecast_deviation()
         self.reset()
 
     def reset(self) -> None:
@@ -67,6 +130,8 @@ class PredictiveController:
         # u(k-1), u(k-2), ..., after a 0 that stands for future inputs.
         self._inputs = np.zeros((n, 1 + int(self._delay.max()) + len(self._p.b)))
         self._plan = np.zeros((HORIZON, n))
+        self._setpoint = np.full(n, np.nan)  # the latest, degC
+        self._age = np.zeros(n, np.intp)  # samples since it began
 
     def act(self, observation: Array) -> NDArray[np.float32]:
         """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
@@ -76,7 +141,7 @@ class PredictiveController:
             self._filter(setpoint - seen[:, self._p.setpoint_window])
         _, G, Q = self._model(self._k)
         free = np.take_along_axis(self._predict(), self._reached, axis=1)
-        target = np.einsum("ni,nij->nj", setpoint[:, np.newaxis] - free, G)
+        target = np.einsum("ni,nij->nj", self._aims(setpoint) - free, G)
         start = np.vstack([self._plan[1:], self._plan[-1:]])
         plan = self._optimise(Q, target, start)
         command = plan[0]
@@ -97,6 +162,43 @@ class PredictiveController:
         action = float32_action(command, self._u_min, self._u_max, self._dead_zone)
         return action[:, np.newaxis]
 
+    def _aims(self, setpoint: Array) -> Array:
+        """Return the outputs to aim at when the planned commands show, (runs, HORIZON)."""
+        if not self._levels.random:
+            return np.broadcast_to(setpoint[:, np.newaxis], (len(setpoint), HORIZON))
+        self._age = np.where(setpoint == self._setpoint, self._age + 1, 0)
+        self._setpoint = setpoint
+        held = probability_held(
+            self._age[:, np.newaxis],
+            self._reached + 1,
+            self._levels.shortest,
+            self._levels.longest,
+        )
+        return hedged_setpoints(
+            setpoint[:, np.newaxis],
+            held,
+            self._levels.amplitude,
+            self._deviation[:, np.newaxis],
+        )
+
+    def _forecast_deviation(self) -> Array:
+        """Return the standard deviation of the first output that a new command reaches, degC.
+
+        It is that of the best forecast from the readings of a plant that does not drift, once
+        the filter has settled. The shape is (runs,).
+        """
+        self.reset()
+        model, *_ = self._model(0)
+        for k in range(1, WARM_UP):
+            self._update_covariance(*self._transition(k, model))
+        P = self._covariance
+        variance = np.zeros(self._num_envs)
+        for ahead in range(int(self._delay.max()) + 1):
+            F, Q = self._transition(WARM_UP + ahead, model)
+            P = F @ P @ F.transpose(0, 2, 1) + Q
+            variance = np.where(ahead == self._delay, P[:, 0, 0], variance)
+        return np.sqrt(variance)
+
     def _filter(self, output: Array) -> None:
         """Advance the state from k - 1 to k, and correct it with the reading y(k)."""
         model, *_ = self._model(self._k)
@@ -104,11 +206,16 @@ class PredictiveController:
         x = np.einsum("nij,nj->ni", F, self._state)
         past = np.take_along_axis(self._inputs, self._shows[:, 0], axis=1)
         x[:, 0] += (past * model.beta).sum(axis=1)
+        gain = self._update_covariance(F, Q)
+        self._state = x + gain * (output - x[:, 0])[:, np.newaxis]
+
+    def _update_covariance(self, F: Array, Q: Array) -> Array:
+        """Advance the covariance by a sample, and return the gain of its reading."""
         P = F @ self._covariance @ F.transpose(0, 2, 1) + Q
         variance = P[:, 0, 0] + self._numbers.measurement_noise_variance
-        gain = P[:, :, 0] / variance[:, np.newaxis]
-        self._state = x + gain * (output - x[:, 0])[:, np.newaxis]
+        gain: Array = P[:, :, 0] / variance[:, np.newaxis]
         self._covariance = P - gain[:, :, np.newaxis] * P[:, np.newaxis, 0]
+        return gain
 
     def _transition(self, k: int, model: LinearModel) -> tuple[Array, Array]:
         """Return the state transition from k - 1 to k, and the process noise's covariance."""
@@ -133,13 +240,9 @@ class PredictiveController:
         moved *= np.stack([model.beta for model in models], axis=1)
         outputs = [self._state[:, i] for i in range(n_y - 1, -1, -1)]
         xi = self._state[:, n_y:-2]
-        steps, walk = self._state[:, -2], self._state[:, -1]
-        for i, (k, model, flow) in enumerate(
-            zip(ahead, models, moved.sum(axis=2).T, strict=True)
-        ):
-            if k % LOAD_INTERVAL == 0:
-                steps = steps * self._stays
-            output = flow + model.load * (steps + walk)
+        load = self._state[:, -2] + self._state[:, -1]
+        for i, (model, flow) in enumerate(zip(models, moved.sum(axis=2).T, strict=True)):
+            output = flow + model.load * load
             for j in range(len(self._p.a) - 1):
                 output = output + model.alpha[:, j] * outputs[-1 - j]
             for j in range(i + 1, len(c)):
