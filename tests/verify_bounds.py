@@ -13,6 +13,7 @@ from benchmarks.lib.report import on_screen
 from benchmarks.lib.statistics import student
 from benchmarks.loop.linear import nominal
 from benchmarks.loop.rollout import mean_error
+from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import SEED
 from mptc_gym.plant import action_from_command
@@ -25,6 +26,7 @@ CASES = {
     **PRESETS,
     "constant": {"setpoint": 5.0},
     "constant, noise": {"setpoint": 5.0, **NOISE},
+    "constant, load": SCENARIOS["load"].arguments,
     **{f"square, held {each / 2:g}": {"setpoint_period": each} for each in PERIODS},
     "random": RANDOM,
     "random, noise": {**RANDOM, **NOISE},

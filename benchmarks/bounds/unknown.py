@@ -54,6 +54,7 @@ WALK_SLICES = 4  # of each step of the walk
 JUMP_ATOMS = 32  # that represent the effect of a jump and of those after it, with the noise
 JUMP_SLICES = 8  # of the new level after a jump
 LEVELS = 8  # slices of the level known at k - d - 1, an even number
+NEGLIGIBLE = 1e-8  # degC^2: variance of exact readings, which keeps rounding harmless
 # The slopes of the lines, which touch E|m - n| at quantiles of n. They are closer together
 # towards 1, where E|m - n| bends most slowly towards |m|.
 SLOPES = 1.0 - np.array([64, 53, 42, 31, 22, 14, 8, 4, 1, 0]) / 64.0
@@ -120,9 +121,7 @@ def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
     P = filtered[0]
     for k in range(1, len(F)):
         P = F[k] @ P @ F[k].T + Q[k]
-        variance = P[0, 0] + reading_variance
-        if variance > 0.0:  # otherwise the reading says nothing new
-            P = P - np.outer(P[:, 0], P[0]) / variance
+        P = P - np.outer(P[:, 0], P[0]) / (P[0, 0] + max(reading_variance, NEGLIGIBLE))
         filtered[k] = P
     return filtered
 
