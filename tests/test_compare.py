@@ -407,7 +407,7 @@ class TestCompare:
         agents = "pi pi-simc dahlin ppo nn idle"
         out = compared(f"--plant {plant} --scenarios square --agents {agents} --runs 1")
         page, screen = (out / "report.md").read_text(), capsys.readouterr().out
-        for text in (page, screen):
+        for text in (page, " ".join(screen.split())):  # lines are wrapped on the screen
             assert "PI (1992) was made for a plant of negative gain" in text
             assert "so the loop runs in positive feedback" in text
             # NN (1992) knows the direction, but its gains are for a plant eight times as slow.
