@@ -314,7 +314,8 @@ def report(
             score_table(runs, estimates, scores, misfits),
             {
                 "scores.png": "The score of each controller, and a small tick for each case",
-                "travel.png": "Mean error and mean valve travel of each controller; lower left is better",
+                "travel.png": "Mean error and mean valve travel of each controller; the lower "
+                "left is better",
             },
         ),
         Section(
@@ -341,7 +342,10 @@ def report(
         Section(
             "Cases",
             table=pd.DataFrame(titles.items(), columns=["case", "what it is"]),
-            pictures={f"{name}.png": f"Temperature and applied flow over time: {title}" for name, title in titles.items()},
+            pictures={
+                f"{name}.png": f"Temperature and applied flow over time: {title}"
+                for name, title in titles.items()
+            },
         ),
     ]
     marks = {label(agent): f"{label(agent)} {MARK}" for agent in misfits}

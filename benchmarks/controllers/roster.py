@@ -39,7 +39,7 @@ from mptc_gym import PRESETS, Parameters
 
 LAMBDA = 0.1  # closed-loop time constant of Dahlin's controller, as a share of the plant's
 # Colours and markers of a user's own controllers, in turn.
-OWN_LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "p"), ("#17798C", "h")
+OWN_LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d")
 
 
 def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
@@ -136,7 +136,7 @@ _SPECS = (
     ControllerSpec(
         name="pi-simc",
         label="PI (SIMC)",
-        look=("#8E3B6B", "s"),
+        look=("#9B2F8C", "h"),
         build=PIController.simc,
         prior_knowledge=STEP_TEST,
         knows=_STEP_TEST,
@@ -147,7 +147,7 @@ _SPECS = (
     ControllerSpec(
         name="pi-searched",
         label="PI (searched)",
-        look=("#4F1F3B", "s"),
+        look=("#5A1220", "p"),
         build=partial(PIController, kp=SEARCHED_GAINS["kp"], ki=SEARCHED_GAINS["ki"]),
         knows="gains of the search, for the paper's plant",
         searched="2 gains by an earlier version of the search; one of today takes 800 trials: "
@@ -183,7 +183,7 @@ _SPECS = (
     ControllerSpec(
         name="self-tuning",
         label="self-tuning",
-        look=("#00B98A", "v"),
+        look=("#5FCF9F", "v"),
         build=SelfTuningController,
         prior_knowledge=DATA_SHEET,
         knows=f"{_DATA_SHEET}; delay range",
@@ -239,7 +239,7 @@ _SPECS = (
     ControllerSpec(
         name="neural-self-tuning",
         label="neural self-tuning",
-        look=("#00664B", "v"),
+        look=("#005A3C", "v"),
         build=NeuralSelfTuningController,
         prior_knowledge=DATA_SHEET,
         knows=f"{_DATA_SHEET}; delay range",
