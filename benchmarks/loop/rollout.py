@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.acting import rollout as run_batch
+from mptc_gym.adapters import Plants, adapted
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import action_from_command, least_effective
 from mptc_gym.signals import Ranges
@@ -107,8 +108,9 @@ def rollout(
     seeds = [*range(seed, seed + plants.num_envs)]
     agent.reset()
     act = partial(_watched, before, itertools.count(), agent.act) if before else agent.act
-    signals, steps = [], run_batch(plants, act, samples, seeds)
-    for (at, _), (after, _) in itertools.pairwise(steps):
+    given = plants if isinstance(plants, Plants) else adapted(plants)
+    signals, steps = [], run_batch(given, act, samples, seeds)
+    for (_, at, _), (_, after, _) in itertools.pairwise(steps):
         # A step reports the command and the applied flow of the sample that it starts at.
         here = at["setpoint"], at["output"], after["command"], after["applied"]
         signals.append(np.array([*here, after["error"], after["setpoint"]]))
