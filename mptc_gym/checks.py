@@ -22,7 +22,7 @@ _COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # faster to pass than the type
 _SHOWN = 80  # characters of a value shown in an error message
 # What arrays, tensors and Python raise if a value is no number.
-_NO_NUMBER = TypeError, ValueError, OverflowError, RuntimeError
+_NO_NUMBER = AttributeError, TypeError, ValueError, OverflowError, RuntimeError
 
 Number = float | Sequence[float]  # or a range, [low, high]
 Check = Callable[[str, Any], Any]
