@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mptc_gym.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.env import INFO, HasPlainSpec, observation_space
 from mptc_gym.parameters import Parameters
+from mptc_gym.plant_state import PlantState, plant_state
 from mptc_gym.signals import FOREVER
 
 Array = Any  # of NumPy or PyTorch, depending on the environment
@@ -69,6 +70,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             self._factor_names = FACTORS
         self._names = (*names, *self._factor_names)
         self._masks = tuple(f"_{name}" for name in self._names)
+        self._drawn_numbers: dict[str, Array] = {}  # the arguments that are ranges, by name
         # Steps of the environment. A plant's k is the clock minus the start of its episode.
         self._clock = 0
         self._starts = np.zeros(num_envs, np.int64)
@@ -190,11 +192,28 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             self._ended = still_ended if still_ended.any() else None
         flags = self._flags(mask)
         first_infos = self._begin(mask)
+        for name in self.parameters.ranges:
+            present = self._drawn_numbers.get(name, 0)
+            self._drawn_numbers[name] = self._where(flags, first_infos[name], present)
         for name in {*self._names, *first_infos}:
             values = first_infos.get(name, self._zeros)
             infos[name] = self._where(flags, values, infos.get(name, 0))
             infos.setdefault(f"_{name}", flags)
         return infos
+
+    def plant_state(self) -> PlantState:
+        """Return what a teacher may know of each plant at the present sample.
+
+        These are delay (samples), dead zone (t/h), gain (degC per t/h) and time constant (s),
+        with their drift, and the load (degC), each of shape (num_envs,). A policy cannot see
+        them, but a critic or a teacher in training may. They are of the episode that `step` or
+        `reset` has just returned an observation of. Before the first reset, a `ResetNeeded` is
+        raised.
+        """
+        if not self._first_end:
+            raise ResetNeeded("call reset before plant_state")
+        ages = self._from_host(self._clock - self._starts)
+        return plant_state(self.parameters, self._drawn_numbers, ages, self._present_load())
 
     def _checked_mask(self, options: Mapping[str, Any]) -> Mask:
         """Return the mask of the plants to reset: all, unless the options say otherwise."""
@@ -216,6 +235,14 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     @abstractmethod
     def _flags(self, mask: Mask) -> Array:
         """Return a mask as a new array of the environment's library."""
+
+    @abstractmethod
+    def _from_host(self, values: NDArray[Any]) -> Array:
+        """Return numbers, shape (num_envs,), as an array of the environment's library."""
+
+    @abstractmethod
+    def _present_load(self) -> Array:
+        """Return the load w at the present sample, degC, shape (num_envs,)."""
 
     @abstractmethod
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:

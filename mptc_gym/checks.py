@@ -22,7 +22,7 @@ _COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # faster to pass than the type
 _LONGEST_REPR = 80  # characters of a value in an error message
 # What arrays, tensors and Python raise if a value is not a number.
-_NOT_A_NUMBER = TypeError, ValueError, OverflowError, RuntimeError
+_NOT_A_NUMBER = AttributeError, TypeError, ValueError, OverflowError, RuntimeError
 
 Number = float | Sequence[float]  # a number, or a range [low, high]
 Check = Callable[[str, Any], Any]  # of an argument's name and value; see `mptc_gym.parameters`

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
+from weakref import WeakSet
 
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
@@ -32,6 +33,7 @@ _GRID = (236, 237, 240)
 _INK = (60, 64, 70)
 _PAPER = (255, 255, 255)
 clock = pygame.time.Clock()  # limits the frame rate
+viewers: WeakSet[object] = WeakSet()  # environments that show pictures in the window
 
 
 class Place(NamedTuple):
@@ -209,8 +211,12 @@ def frame(record: Record) -> NDArray[np.uint8]:
     return np.array(pygame.surfarray.pixels3d(draw(record)).swapaxes(0, 1), order="C")
 
 
-def show(record: Record, fps: float) -> None:
-    """Show a picture in the window, opened if necessary, at most `fps` times a second."""
+def show(record: Record, fps: float, viewer: object) -> None:
+    """Show a picture in the window, opened if necessary, at most `fps` times a second.
+
+    All environments show their pictures in one window, until each `viewer` has called `hide`.
+    """
+    viewers.add(viewer)
     pygame.display.init()
     screen = pygame.display.get_surface()
     if screen is None or screen.get_size() != SIZE:
@@ -220,6 +226,13 @@ def show(record: Record, fps: float) -> None:
     pygame.event.pump()
     clock.tick(fps)
     pygame.display.flip()
+
+
+def hide(viewer: object) -> None:
+    """Close the window, unless another environment shows its pictures in it."""
+    viewers.discard(viewer)
+    if not viewers:
+        pygame.display.quit()
 
 
 def ticks(low: float, high: float) -> list[float]:

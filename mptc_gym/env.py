@@ -395,15 +395,15 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
 
         if self.render_mode == "rgb_array":
             return drawing.frame(self._record)
-        drawing.show(self._record, self.metadata["render_fps"])
+        drawing.show(self._record, self.metadata["render_fps"], self)
         return None
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, unless another environment shows its pictures in it."""
         if self.render_mode == "human" and self._record is not None:
-            import pygame
+            from mptc_gym import drawing  # which needs pygame
 
-            pygame.display.quit()
+            drawing.hide(self)
         self._record = None
 
     def _add_more_info(self, info: dict[str, float], load: float) -> None:

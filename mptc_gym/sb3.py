@@ -14,195 +14,32 @@ import json
 import pkgutil
 import tempfile
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
-from itertools import accumulate, pairwise, starmap
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import gymnasium
-import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, VectorEnv
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env import sync_envs_normalization as synchronise
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+from stable_baselines3.common.vec_env import sync_envs_normalization as bring_statistics
 
-from mptc_gym.acting import check_fit, make_one, native_batch, natives, opened, overlap
+from mptc_gym.acting import opened, refuse_the_models_own
+from mptc_gym.adapters import adapted
 from mptc_gym.checks import MOST_PLANTS, count, reject
-from mptc_gym.evaluation import EPISODES, SEED, WINDOWS, Evaluation, evaluate
-from mptc_gym.wrappers import IncrementalAction
+from mptc_gym.copies import copied
+from mptc_gym.evaluation import VALIDATION_SEED, WINDOWS, Evaluation, evaluate
+from mptc_gym.fit import check_fit
+from mptc_gym.layers import have_a_layer_in_common, is_environment, plant_groups
+from mptc_gym.making import make_batch, make_one
+from mptc_gym.sb3_vec_env import GymnasiumVecEnv, make_vec_env
 
 __all__ = ["GymnasiumVecEnv", "ScoreCallback", "load", "make_vec_env", "save", "spec_of"]
 
 MEMBER = "mptc_gym.json"  # of a zip
-_SAME_STEP = AutoresetMode.SAME_STEP
-
-
-class GymnasiumVecEnv(VecEnv):
-    """Step whole batches at once, where `DummyVecEnv` steps one environment after another.
-
-    All that it returns is bit for bit that of `DummyVecEnv` with the same environments, but for
-    infos: `step` lists those of last samples only, as dicts would take longer than the step,
-    and `infos` holds the latest of all in Gymnasium's form, as arrays.
-
-    Parameters
-    ----------
-    batches
-        Vector environments of autoreset mode "SameStep" and with the same spaces; their
-        environments are numbered one batch after another.
-    spec, group
-        Spec of one environment with its wrappers, if all are alike; and number of neighbours
-        that share a seed, and thus what is drawn.
-    """
-
-    def __init__(
-        self, *batches: VectorEnv, spec: EnvSpec | None = None, group: int = 1
-    ) -> None:
-        modes = {batch.metadata.get("autoreset_mode") for batch in batches}
-        if modes != {_SAME_STEP}:
-            raise ValueError(f"batches must have autoreset_mode 'SameStep', got {modes}")
-        self.batches, self.spec, self.group = batches, spec, group
-        self.infos: dict[str, Any] = {}
-        # Of each environment, the number of its batch and its own number there.
-        self._places = [(i, j) for i, each in enumerate(batches) for j in range(each.num_envs)]
-        edges = accumulate((batch.num_envs for batch in batches), initial=0)
-        self._parts: Any = [*zip(batches, starmap(slice, pairwise(edges)), strict=True)]
-        spaces = batches[0].single_observation_space, batches[0].single_action_space
-        super().__init__(len(self._places), *spaces)
-        self._totals = np.zeros((2, self.num_envs))  # return and length of each episode
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seeds of the next reset: environment i has `seed + i // group`."""
-        first, *_ = super().seed(seed)
-        self._seeds = [cast("int", first) + i // self.group for i in range(self.num_envs)]
-        return self._seeds
-
-    def reset(self) -> NDArray[Any]:
-        """Reset all environments, with the seeds set by `seed`."""
-        resets = [batch.reset(seed=self._seeds[part]) for batch, part in self._parts]
-        self._reset_seeds()
-        self._totals[:] = 0.0
-        self.reset_infos = [_alone(resets[i][-1], j) for i, j in self._places]
-        return self._joined(resets)[0]
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions, shape (num_envs, action size)."""
-        self._actions = actions
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Step with the stored actions."""
-        steps = [batch.step(self._actions[part]) for batch, part in self._parts]
-        observations, rewards, terminated, truncated = self._joined(steps)
-        ended = terminated | truncated
-        self._totals[0] += rewards
-        self._totals[1] += 1.0
-        infos: list[dict[str, Any]] = [{} for _ in ended]
-        for place in np.flatnonzero(ended).tolist():
-            i, j = self._places[place]
-            *_, found = steps[i]
-            gained, length = self._totals[:, place].tolist()
-            self.reset_infos[place] = _alone(found, j)
-            infos[place] = {
-                **_alone(found["final_info"], j),
-                "terminal_observation": found["final_obs"][j],
-                "TimeLimit.truncated": bool(truncated[place] and not terminated[place]),
-                "episode": {"r": gained, "l": int(length)},
-            }
-        self._totals[:, ended] = 0.0
-        return observations, rewards.astype(np.float32), ended, infos
-
-    def _joined(self, returned: list[tuple[Any, ...]]) -> list[NDArray[Any]]:
-        """Concatenate what the batches returned, and store the infos in `infos`."""
-        *arrays, infos = zip(*returned, strict=True)
-        self.infos = {
-            name: np.concatenate([each[name] for each in infos])
-            for name in set.intersection(*map(set, infos))
-            if isinstance(infos[0][name], np.ndarray)
-        }
-        return [np.concatenate(each) for each in arrays]
-
-    def get_images(self) -> list[NDArray[np.uint8]]:
-        """Return a picture of each environment, if the batch has the mode "rgb_array"."""
-        return [image for batch in self.batches for image in cast("Any", batch.render() or ())]
-
-    def close(self) -> None:
-        """Close the batches."""
-        for batch in self.batches:
-            batch.close()
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of each environment's batch, but its own `spec`."""
-        chosen = [self.batches[self._places[i][0]] for i in self._get_indices(indices)]
-        return [self.spec if attr_name == "spec" else getattr(b, attr_name) for b in chosen]
-
-    def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
-        """Refuse: an environment of a batch has no methods or attributes of its own."""
-        raise NotImplementedError(f"use `batches`, for all at once, got {args or kwargs}")
-
-    set_attr = env_method
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Return False for each index: a batch holds no wrapped environments."""
-        return [False for _ in self._get_indices(indices)]
-
-
-def _alone(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """Return the infos of environment i of a batch, as it would give them alone."""
-    return {
-        name: values[i].item() if isinstance(values[i], np.generic) else values[i]
-        for name, values in infos.items()
-        if f"_{name}" in infos and infos[f"_{name}"][i] and not name.startswith("final_")
-    }
-
-
-def make_vec_env(
-    env: str | EnvSpec = "MiddlePoint-v0",
-    n_envs: int = 1,
-    *,
-    seed: int | None = None,
-    group: int = 1,
-    wrapper: Mapping[str, Any] | Callable[..., Any] | None = None,
-    **arguments: Any,
-) -> GymnasiumVecEnv:
-    """Make plants that are stepped together, for the algorithms of Stable-Baselines3.
-
-    Parameters
-    ----------
-    env, **arguments
-        An id or an `EnvSpec`, and further arguments for it, as in `gymnasium.make`;
-        `render_mode` may be "rgb_array".
-    n_envs
-        Number of plants.
-    seed
-        Seed of the first plant at the first reset; plant i has `seed + i // group`. The seed of
-        a model, if it has one, replaces it.
-    group
-        Number of neighbouring plants that share a seed: they draw the same noise, load and
-        set points, and differ only in what a policy explores.
-    wrapper
-        Adds `IncrementalAction`: its arguments, or the class itself for its defaults. Others
-        cannot take a batch: use `stable_baselines3.common.env_util.make_vec_env`.
-    """
-    n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
-    group = count("group", group, 1, n_envs)
-    mode = arguments.pop("render_mode", None)  # of the batch alone, not of its spec
-    single = make_one(env, arguments)
-    if isinstance(wrapper, Mapping):
-        single = IncrementalAction(single, **wrapper)
-    elif callable(wrapper):
-        single = wrapper(single)
-    elif wrapper is not None:
-        reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
-    batch = native_batch(single, n_envs, autoreset_mode=_SAME_STEP, render_mode=mode)
-    if batch is None:
-        reject("env", single, "of this package, in no wrapper other than IncrementalAction")
-    plants = GymnasiumVecEnv(batch, spec=single.spec, group=group)
-    plants.seed(seed)
-    return plants
 
 
 def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any) -> EnvSpec:
@@ -213,20 +50,24 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
     Wrappers of Stable-Baselines3, such as `VecNormalize`, are not in a spec. ValueError if the
     model's environments cannot be made from theirs.
     """
-    own, (plant, *_) = _spec(policy), natives(policy.get_env())
-    windows = dict(zip(WINDOWS, plant.parameters.windows, strict=True))
-    spec = cast("EnvSpec", make_one(env, {**windows, **arguments}).spec)
-    return dataclasses.replace(spec, additional_wrappers=own.additional_wrappers)
+    spec_of_training = _spec(policy)
+    windows = plant_groups(policy.get_env())[0].parameters.windows
+    arguments = {**dict(zip(WINDOWS, windows, strict=True)), **arguments}
+    spec = cast("EnvSpec", make_one(env, arguments).spec)
+    wrappers = spec_of_training.additional_wrappers
+    return dataclasses.replace(spec, additional_wrappers=wrappers)
 
 
 def _spec(model: Any) -> EnvSpec:
     """Return the spec of the first of a model's environments, if that makes one."""
     spec: Any = None
     try:
-        spec, *_ = model.get_env().get_attr("spec")
+        spec = model.get_env().get_attr("spec")[0]
         # Gymnasium cannot make the Monitor that each model adds, and it changes nothing.
-        kept = tuple(each for each in spec.additional_wrappers if each.name != "Monitor")
-        spec = dataclasses.replace(spec, additional_wrappers=kept)
+        wrappers = [
+            wrapper for wrapper in spec.additional_wrappers if wrapper.name != "Monitor"
+        ]
+        spec = dataclasses.replace(spec, additional_wrappers=tuple(wrappers))
         gymnasium.make(EnvSpec.from_json(spec.to_json()))
     except Exception as error:  # from wrappers of anybody
         raise ValueError(
@@ -242,12 +83,19 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     """Save a model atomically, with the spec of its environments.
 
     The zip is that of `model.save` with one more member; `.zip` is added to a name without an
-    ending. A `VecEnvWrapper`, such as `VecNormalize`, is no part of a spec: a model in one is
-    saved as Stable-Baselines3 does. ValueError if the environments differ or cannot be made
-    from their spec, or the file cannot be written.
+    ending. ValueError if the environments differ or cannot be made from their spec, of which a
+    `VecEnvWrapper`, such as `VecNormalize`, is no part; or if the file cannot be written.
     """
-    path, spec, plants = _zip_path(path), _spec(model), cast("VecEnv", model.get_env())
-    if isinstance(plants, VecEnvWrapper) or len({str(s) for s in plants.get_attr("spec")}) > 1:
+    path = _zip_path(path)
+    with _zip_of(model, path) as complete:
+        complete.replace(path)
+
+
+@contextmanager
+def _zip_of(model: BaseAlgorithm, path: Path) -> Iterator[Path]:
+    """Yield a complete zip of a model, in a new folder beside `path`, which is then deleted."""
+    spec, plants = _spec(model), cast("VecEnv", model.get_env())
+    if isinstance(plants, VecEnvWrapper) or len({*map(str, plants.get_attr("spec"))}) > 1:
         raise ValueError(
             "policy must have environments that do not differ, in no VecEnvWrapper, to be "
             f"saved here, got {type(plants).__name__}: save it by model.save(path), and "
@@ -258,11 +106,11 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     try:
         # A folder of its own: whatever the name, nobody else writes there.
         with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
-            partial_zip = Path(folder, "model.zip")
-            model.save(partial_zip)
-            with zipfile.ZipFile(partial_zip, "a") as archive:
+            complete = Path(folder, "model.zip")
+            model.save(complete)
+            with zipfile.ZipFile(complete, "a") as archive:
                 archive.writestr(MEMBER, record)
-            partial_zip.replace(path)
+            yield complete
     except OSError as error:
         raise ValueError(f"{path} cannot be written: {error.strerror}") from error
 
@@ -271,23 +119,33 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     """Load a model that `save` wrote, with as many environments like its own.
 
     Loading runs code from the zip and the modules that it names: load only what you trust.
-    `arguments` are those of the algorithm's own `load`, such as `device="cpu"`. A file that
-    cannot be loaded is a ValueError.
+    `arguments` are those of the algorithm's own `load`, such as `device="cpu"`. ValueError if
+    the file is missing, is none of `save`, or cannot be loaded.
     """
     path = _zip_path(path)
+    if not path.is_file():
+        reject("path", str(path), "an existing file")
     try:
         with zipfile.ZipFile(path) as archive:
-            about, data = (json.loads(archive.read(name)) for name in (MEMBER, "data"))
-        spec, n = EnvSpec.from_json(about["spec"]), data["n_envs"]
-        one = partial(gymnasium.make, spec)
-        native = native_batch(one(), 1) is not None
-        plants: VecEnv = make_vec_env(spec, n) if native else DummyVecEnv([one] * n)
-        algorithm = pkgutil.resolve_name(about["algorithm"])
-        return cast("BaseAlgorithm", algorithm.load(path, plants, **arguments))
+            record = json.loads(archive.read(MEMBER))
+            n_envs = json.loads(archive.read("data"))["n_envs"]
+        make = partial(gymnasium.make, EnvSpec.from_json(record["spec"]))
+        algorithm = pkgutil.resolve_name(record["algorithm"])
     except Exception as error:  # of any kind, from a damaged file or the code in it
         raise ValueError(
-            f"{path} must be a zip of mptc_gym.sb3.save; others are loaded by their algorithm, "
-            f"and scored where you say that they act ({type(error).__name__}: {error})"
+            f"{path} must be a zip of mptc_gym.sb3.save; load others by their algorithm, and "
+            "say where they act: evaluate(model, env) "
+            f"({type(error).__name__}: {error})"
+        ) from error
+    try:
+        is_native = make_batch(make(), 1) is not None
+        plants: VecEnv = DummyVecEnv([make] * n_envs)
+        if is_native:
+            plants = make_vec_env(EnvSpec.from_json(record["spec"]), n_envs)
+        return cast("BaseAlgorithm", algorithm.load(path, plants, **arguments))
+    except Exception as error:  # of any kind, from an algorithm or a wrapper of anybody
+        raise ValueError(
+            f"{path} cannot be loaded here ({type(error).__name__}: {error})"
         ) from error
 
 
@@ -300,21 +158,22 @@ def _zip_path(path: str | Path) -> Path:
 class ScoreCallback(BaseCallback):
     """Score the policy during training, without exploration, and keep the best.
 
-    The episodes differ from those of `mptc_gym.evaluate`. Where nothing is drawn, as in
-    `MiddlePoint-v0`, all are the same: select by another set point, `setpoint_period=500`. The
-    log gets `score/mean_error` and, with a bound, `score/score`.
+    The episodes are those of `VALIDATION_SEED`, which no published score uses. Where nothing is
+    random, as in `MiddlePoint-v0`, all are the same: select by another set point,
+    `setpoint_period=500`. The log gets `score/mean_error` and, with a bound, `score/score`.
 
     Parameters
     ----------
     env, **arguments
-        Where to score, as in `mptc_gym.evaluate`; never the environments of the training. An id
-        or a spec takes the windows and wrappers of the training, see `spec_of`. A
-        `VecNormalize` is given the statistics of the training before each score.
+        Where to score, as in `mptc_gym.evaluate`; it may also be the environment of the
+        training. An id or a spec takes the windows and wrappers of the training, see `spec_of`.
+        A copy of a `VecNormalize` takes its statistics.
     every, episodes
         Samples of experience between scores, the last at the end of training; and episodes per
-        score. Where bounds differ by episode, there are only 20 of them.
+        score. Where bounds differ by episode, there are only 200 of them.
     path
-        Zip in which to keep the policy with the least mean error, if any; see `save`.
+        Zip in which to keep the policy with the least mean error, if any; see `save`. A file
+        that exists before the first training is not overwritten: it is a ValueError.
     verbose
         1 prints each score, 0 does not.
 
@@ -342,32 +201,51 @@ class ScoreCallback(BaseCallback):
         self.path = None if path is None else _zip_path(path)
         self.scores: list[tuple[int, Evaluation]] = []
         self.best: Evaluation | None = None
-        self._env, self._arguments = env, arguments
+        self._env = env
+        self._arguments = arguments
+        self._has_saved = False
 
     def _init_callback(self) -> None:
-        env, arguments = self._env, self._arguments
-        if isinstance(env, str | EnvSpec):
-            env, arguments = spec_of(self.model, env, **arguments), {}
-        elif overlap(env, self.training_env):
-            raise ValueError("env must not be the environments of the training: make others")
-        self._latest = self.model.num_timesteps
-        # Not kept in place of the id: the next model may have other windows.
-        self._score_in: Any = partial(evaluate, env=env, **arguments)
-        self._hand_over()
-        if self.path is not None:  # what cannot be saved, or not there, is said now
-            trial = self.path.with_name(f".{self.path.name}")
-            save(self.model, trial)
-            trial.unlink()
-        if isinstance(env, EnvSpec) or callable(env):
-            with opened(env, 1) as plants:
-                check_fit(self.model, plants)
+        self._latest = self.model.num_timesteps  # of the latest score
+        if self.path is not None:
+            if self.path.exists() and not self._has_saved:
+                allowed = "a file that does not exist yet, as it would be overwritten"
+                reject("path", str(self.path), allowed)
+            with _zip_of(self.model, self.path):
+                pass  # it can be saved
+        self._check_environment()
 
-    def _hand_over(self) -> None:
-        """Give the statistics of the training to the environments of the scores."""
-        if self.model.get_vec_normalize_env() is None or not isinstance(self._env, VecEnv):
+    def _check_environment(self) -> None:
+        """Refuse, before the training, environments that the model cannot be scored in."""
+        if not is_environment(self._env):
+            env, arguments = self._where()
+            if isinstance(env, EnvSpec) or callable(env):
+                with opened(env, 1, **arguments) as plants:
+                    check_fit(self.model, plants)
+            return
+        copy = copied(self._env)
+        refuse_the_models_own(copy, self.model)
+        self._bring_statistics(copy.env)
+        check_fit(self.model, adapted(copy.env))
+
+    def _where(self) -> tuple[Any, dict[str, Any]]:
+        """Return where to score, and arguments for `evaluate`."""
+        if isinstance(self._env, str | EnvSpec):
+            return spec_of(self.model, self._env, **self._arguments), {}
+        if not is_environment(self._env):
+            return self._env, self._arguments
+        env = copied(self._env).env
+        self._bring_statistics(env)
+        return env, self._arguments
+
+    def _bring_statistics(self, env: Any) -> None:
+        """Bring the statistics of the training to a copy of environments."""
+        if have_a_layer_in_common(self._env, self.training_env):
+            return  # which the copy has
+        if self.model.get_vec_normalize_env() is None or not isinstance(env, VecEnv):
             return
         try:
-            synchronise(self.training_env, self._env)
+            bring_statistics(self.training_env, env)
         except (AssertionError, AttributeError) as error:
             raise ValueError(f"env must be wrapped as in training: {error}") from error
 
@@ -381,17 +259,22 @@ class ScoreCallback(BaseCallback):
             self._score()
 
     def _score(self) -> None:
-        self._hand_over()
-        self._latest = now = self.num_timesteps
-        found = self._score_in(self.model, episodes=self.episodes, seed=SEED + EPISODES)
-        self.scores.append((now, found))
-        self.logger.record("score/mean_error", found.mean_error)
-        if found.score is not None:
-            self.logger.record("score/score", found.score)
-        best = self.best is None or found.mean_error < self.best.mean_error
-        self.best = found if best else self.best
-        if best and self.path is not None:
-            save(self.model, self.path)
+        self._latest = self.num_timesteps
+        env, arguments = self._where()
+        result = evaluate(
+            self.model, env, episodes=self.episodes, seed=VALIDATION_SEED, **arguments
+        )
+        self.scores.append((self.num_timesteps, result))
+        self.logger.record("score/mean_error", result.mean_error)
+        if result.score is not None:
+            self.logger.record("score/score", result.score)
+        is_best = self.best is None or result.mean_error < self.best.mean_error
+        if is_best:
+            self.best = result
+            if self.path is not None:
+                save(self.model, self.path)
+                self._has_saved = True
         if self.verbose:
-            total = self.locals.get("total_timesteps", now)
-            print(f"{now:,} of {total:,} samples: {found}{'; best' * best}", flush=True)
+            total = self.locals.get("total_timesteps", self.num_timesteps)
+            mark = "; best" if is_best else ""
+            print(f"{self.num_timesteps:,} of {total:,} samples: {result}{mark}", flush=True)

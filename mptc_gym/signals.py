@@ -172,6 +172,11 @@ class _HeldValues(ABC):
         self._due = np.zeros(num_envs, np.int64)  # the time of each plant's next change
         self._earliest_due = 0
 
+    @property
+    def present(self) -> Values:
+        """The present values of all plants, degC, shape (num_envs,); only to be read."""
+        return self._current
+
     def next(self) -> Values:
         """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
         self._clock += 1

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, ClassVar, cast
 
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.vector import AutoresetMode
 
@@ -16,11 +19,14 @@ except ImportError as error:
     raise DependencyNotInstalled(
         'mptc_gym.torch_env needs PyTorch: pip install "mptc_gym[torch]"'
     ) from error
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.checks import is_count, one_of, reject
-from mptc_gym.parameters import spelt_out
+from mptc_gym.env import MiddlePointEnv
+from mptc_gym.making import make_one
+from mptc_gym.parameters import ARGUMENTS, spelt_out
 from mptc_gym.plant import action_from_command
 from mptc_gym.signals import Levels
 from mptc_gym.torch_episodes import (
@@ -95,7 +101,8 @@ class MiddlePointTorchEnv(BatchEnv):
     policy also learns from commands without effect, whose true gradient is 0. It is 0 beyond
     the actuator's limits and the transmitter's span. `detach` cuts the graph for truncated
     backpropagation. An action shows after `delay` + 1 samples: shorter segments have no
-    gradient. Without `differentiable` no graph is kept.
+    gradient. Without `differentiable` no graph is kept. A copy or a pickle, also in
+    mid-episode, has no graph of earlier actions.
 
     **Waiting.** `step` never waits for the device. So actions that are not finite are refused
     on the CPU only; elsewhere, the plants that got them show NaN until they are reset. `reset`
@@ -150,13 +157,27 @@ class MiddlePointTorchEnv(BatchEnv):
         # Precomputed returns of the steps ahead, the next one last.
         self._ahead: list[tuple[Any, ...]] = []
         self._shown = _Window(self.parameters.windows, self._episodes, differentiable)
+        # w at the samples of the latest block, or at one sample before it.
+        self._loads: list[Tensor] = [self._zeros]
 
     __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> MiddlePointTorchEnv:
+        """Return a copy, also in mid-episode, without the graph of earlier actions."""
+        duplicate: MiddlePointTorchEnv = pickle.loads(pickle.dumps(self))
+        return duplicate
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of a pickle, which has lost the graph of earlier actions."""
+        vars(self).update(state)
+        self.detach()
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions, for truncated backpropagation.
 
-        What later steps return then depends only on actions from now on.
+        What later steps return then depends only on actions after this call. What earlier
+        steps have returned stays attached. So detach the latest observation, too, before the
+        policy sees it: through it, the next action would depend on earlier ones.
         """
         self._plants.detach()
         self._shown.detach()
@@ -175,7 +196,8 @@ class MiddlePointTorchEnv(BatchEnv):
         if self.parameters.move_weight:
             rewards = rewards - self.parameters.move_weight * (a - self._action).abs()
             self._action = a.clone()  # the caller may overwrite it
-        infos["command"], infos["applied"] = command, applied
+        infos["command"] = command
+        infos["applied"] = applied
         return observations, rewards, terminations, truncations, infos
 
     def _compute_block(self) -> None:
@@ -205,6 +227,7 @@ class MiddlePointTorchEnv(BatchEnv):
         }
         if load is not None:
             infos["disturbance"] = load.unbind()
+            self._loads = [*load.clone().unbind()]  # as the caller may overwrite infos
         infos |= zip(self._factor_names, zip(*factors, strict=True), strict=False)
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         masks = dict.fromkeys(self._masks, everyone)
@@ -224,7 +247,9 @@ class MiddlePointTorchEnv(BatchEnv):
 
     def _begin(self, mask: Mask) -> dict[str, Tensor]:
         which = self._flags(mask)
-        self._episodes.clock, self._episodes.unused = self._clock, len(self._ahead)
+        self._loads = [torch.where(which, 0.0, self._present_load())]
+        self._episodes.clock = self._clock
+        self._episodes.unused = len(self._ahead)
         self._ahead = []
         if mask.all():  # signals may be others than before
             self._episodes.unused = 0
@@ -245,6 +270,15 @@ class MiddlePointTorchEnv(BatchEnv):
     def _flags(self, mask: Mask) -> Tensor:
         flags = torch.empty(self.num_envs, dtype=torch.bool, device=self.device)
         return flags.copy_(torch.from_numpy(mask), non_blocking=True)  # without waiting
+
+    def _from_host(self, values: NDArray[Any]) -> Tensor:
+        tensor: Tensor = torch.from_numpy(values).to(self._zeros)
+        return tensor
+
+    def _present_load(self) -> Tensor:
+        if not self.parameters.is_disturbed:
+            return torch.zeros_like(self._zeros)
+        return self._loads[-1 - len(self._ahead)]
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
@@ -288,6 +322,47 @@ class MiddlePointTorchEnv(BatchEnv):
         return a
 
 
+def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePointTorchEnv:
+    """Make many plants of an id or a spec, as `gymnasium.make_vec` does in NumPy.
+
+    Parameters
+    ----------
+    env
+        An id of this package, such as "MiddlePointHard-v0", or an `EnvSpec` without wrappers.
+    num_envs
+        Number of plants.
+    **arguments
+        Those of `MiddlePointTorchEnv`, which replace those of the id.
+
+    Returns
+    -------
+    MiddlePointTorchEnv
+        Its `spec` makes one of these plants in NumPy, as in
+        `mptc_gym.evaluate(policy, plants.spec)`.
+
+    Raises
+    ------
+    ValueError
+        If the id is unknown or of another environment, or an argument is out of range.
+    """
+    of_plant = {name: value for name, value in arguments.items() if name in ARGUMENTS}
+    if "max_episode_steps" in arguments:
+        limit = arguments["max_episode_steps"]
+        of_plant["max_episode_steps"] = -1 if limit is None else limit
+    single = make_one(env, of_plant)
+    plant, spec = single.unwrapped, cast("EnvSpec", single.spec)
+    if not isinstance(plant, MiddlePointEnv) or spec.additional_wrappers:
+        reject("env", env, "the id or the spec of a MiddlePointEnv, without wrappers")
+    arguments = {
+        **asdict(plant.parameters),
+        "max_episode_steps": spec.max_episode_steps,
+        **arguments,
+    }
+    plants = MiddlePointTorchEnv(num_envs, **arguments)
+    plants.spec = spec
+    return plants
+
+
 class _Window:
     """The observations of all plants, with or without gradients for past actions."""
 
@@ -301,7 +376,10 @@ class _Window:
         # Set points, errors and outputs, oldest first: those of one observation, then those of
         # the latest block.
         self._rows = [[zeros] * w for w in self._windows]
-        self._ahead: Iterator[Tensor] = iter(())  # observations of the block, without actions
+        # Observations of the block, without actions: those stacked so far, the next one last;
+        # and the rows at which the others begin.
+        self._stacked: list[Tensor] = []
+        self._unstacked = range(0)
         # Observations are stacked while they fit in the cache.
         numbers = max(1, sum(self._windows) * len(zeros))
         self._at_once = max(1, _IN_CACHE // numbers) if zeros.is_cpu else LONGEST
@@ -324,11 +402,15 @@ class _Window:
         for rows, w, block in zip(self._rows, self._windows, blocks, strict=True):
             if w:
                 rows[:] = [*rows[len(rows) - w :], *block.unbind()]
-        self._ahead = self._stack(1, len(blocks[0]))
+        self._stacked = []
+        self._unstacked = range(1, 1 + len(blocks[0]))
 
     def next(self, a: Tensor) -> Tensor:
         """Return the observations of the next sample of the block, given the action before."""
-        shown = next(self._ahead)
+        if not self._stacked:
+            self._stacked = self._stack(self._unstacked[: self._at_once])[::-1]
+            self._unstacked = self._unstacked[self._at_once :]
+        shown = self._stacked.pop()
         if self._past_actions:
             newest = a.clamp(-1.0, 1.0)[None]
             if self._differentiable:
@@ -340,26 +422,21 @@ class _Window:
 
     def present(self) -> Tensor:
         """Return the observations after a reset."""
-        return torch.cat((*self._stack(0, 1), *self._actions)).t()
+        return torch.cat((*self._stack(range(1)), *self._actions)).t()
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions."""
-        self._ahead = iter([each.detach() for each in self._ahead])
+        self._stacked = [observation.detach() for observation in self._stacked]
         self._rows = [[each.detach() for each in rows] for rows in self._rows]
         self._actions = [each.detach() for each in self._actions]
 
-    def _stack(self, first: int, count: int) -> Iterator[Tensor]:
-        """Yield observations without actions, from index `first` of the rows."""
+    def _stack(self, places: range) -> list[Tensor]:
+        """Return observations without actions, which begin at some places of the rows."""
         n = len(self._zeros)
-        for begin in range(first, first + count, self._at_once):
-            places = range(begin, min(begin + self._at_once, first + count))
-            newest_first = [
-                row
-                for k in places
-                for rows, w in zip(self._rows, self._windows, strict=True)
-                for row in rows[k : k + w][::-1]
-            ]
-            if newest_first:
-                yield from torch.stack(newest_first).view(len(places), -1, n).unbind()
-            else:
-                yield from [self._zeros.new_empty(0, n)] * len(places)
+        newest_first: list[Tensor] = []
+        for k in places:
+            for rows, window in zip(self._rows, self._windows, strict=True):
+                newest_first += rows[k : k + window][::-1]
+        if not newest_first:  # the observation has actions alone
+            return [self._zeros.new_empty(0, n)] * len(places)
+        return [*torch.stack(newest_first).view(len(places), -1, n).unbind()]

@@ -232,6 +232,13 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _flags(self, mask: Mask) -> Mask:
         return mask.copy()
 
+    def _from_host(self, values: NDArray[Any]) -> NDArray[Any]:
+        return values
+
+    def _present_load(self) -> Values:
+        disturbance = self._signals.disturbance
+        return self._zeros if disturbance is None else disturbance.present
+
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():

@@ -12,8 +12,8 @@ from gymnasium.envs.registration import EnvSpec
 from agents import PIController
 from benchmarks.bounds import least_possible
 from benchmarks.bounds.__main__ import PACKAGED as CASES
-from mptc_gym import IDS, PRESETS, Evaluation, MiddlePointEnv, Parameters, evaluate
-from mptc_gym.evaluation import SEED, least_errors
+from mptc_gym import IDS, PRESETS, Evaluation, MiddlePointEnv, Parameters, evaluate, evaluation
+from mptc_gym.evaluation import SEED, VALIDATION_SEED, find_bound
 from tests.conftest import ROOT, run
 
 HARD = "MiddlePointHard-v0"
@@ -80,13 +80,28 @@ class TestEvaluate:
     def test_other_episodes_and_lengths(self):
         found = evaluate(PIController(), HARD, episodes=5, seed=3)
         assert (found.score, found.interval, found.scores) == (None, None, None)
-        assert str(found).endswith("no bound is kept: see python -m benchmarks.bounds --help")
+        assert str(found).endswith(found.note)
+        for result, reason in (
+            (found, "kept for seeds 7,000,000 to 7,000,119.*, not for 3 to 7: choose"),
+            (evaluate(idle, HARD, episodes=121), "not for 7,000,000 to 7,000,120: choose"),
+            (evaluate(idle, episodes=2, max_episode_steps=301), "1,200 samples, not of 301"),
+            (evaluate(idle, episodes=2, delay=3), "presets alone, .* checkout, python -m ben"),
+        ):
+            assert result.score is None
+            assert re.search(reason, result.note)
         assert found.seeds == range(3, 8)
         short = evaluate(idle, episodes=2, max_episode_steps=301)
         # 300 samples at 5 degC but for k = 0, and at k = 300 the next half period begins.
         assert short.mean_error == 5.0
         assert short.score is None
-        assert evaluate(idle, HARD, episodes=121).score is None
+
+    def test_a_score_without_travel_says_why(self):
+        found = evaluate(idle, "MiddlePointRandomised-v0", episodes=2)
+        assert found.score == 0.0
+        assert "no action left the dead zone of 3 to 7 t/h: train in mptc_gym.wr" in str(found)
+        assert "dead zone of 5 t/h" in str(evaluate(idle, episodes=2))
+        assert "the valve never moved" in evaluate(idle, episodes=2, dead_zone=0.0).note
+        assert not evaluate(PIController(), episodes=2).note
 
     def test_help_explains_each_field(self):
         explained = re.findall(r"\n    ([\w, ]+) : ", Evaluation.__doc__)
@@ -99,19 +114,35 @@ class TestEvaluate:
         assert f"score {found.score:.3f} (95 % " in str(found)
         assert "\n" not in str(found)
         same = str(evaluate(idle, episodes=2))  # an interval of no width would mean nothing
-        assert same.endswith("score 0.000; valve travel 0 t/h; 2 episodes, all alike")
+        assert "score 0.000; valve travel 0 t/h; 2 episodes, all alike" in same
 
 
 class TestBounds:
     @pytest.mark.parametrize("name", [*CASES][::3])
     def test_they_are_those_of_the_limits(self, name):
         plant = Parameters(**CASES[name])
-        kept = least_errors(plant, 1200, range(SEED, SEED + 120))
+        kept = find_bound(plant, 1200, range(SEED, SEED + 120)).least
         drawn = bool(plant.ranges) or plant.setpoint == "random"
         assert len(set(kept.tolist())) == (120 if drawn else 1)
         i = 118 if drawn else 0
         least = least_possible(samples=1200, episodes=1, seed=SEED + i, **CASES[name])
         assert kept[i] == pytest.approx(least.value, abs=2e-6)
+
+    def test_a_second_set_of_seeds_has_its_own(self, monkeypatch, tmp_path):
+        kept = json.loads((ROOT / "mptc_gym/bounds.json").read_text(encoding="utf-8"))
+        kept["cases"]["hard"]["validation_least"] = [0.5 + i for i in range(200)]
+        (tmp_path / "bounds.json").write_text(json.dumps(kept), encoding="utf-8")
+        monkeypatch.setattr(evaluation.resources, "files", lambda _: tmp_path)
+        evaluation._read_bounds.cache_clear()
+        hard = Parameters(**PRESETS["hard"])
+        try:
+            seeds = range(VALIDATION_SEED + 198, VALIDATION_SEED + 200)
+            assert [*find_bound(hard, 1200, seeds).least] == [198.5, 199.5]
+            beyond = find_bound(hard, 1200, range(VALIDATION_SEED, VALIDATION_SEED + 201))
+            assert beyond.least is None
+            assert "to 7,000,119 and 5,000,000 to 5,000,199, not" in beyond.why_not
+        finally:
+            evaluation._read_bounds.cache_clear()
 
     def test_they_say_how_they_were_made(self):
         kept = json.loads((ROOT / "mptc_gym/bounds.json").read_text(encoding="utf-8"))

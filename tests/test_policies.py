@@ -1,8 +1,14 @@
 """Policies and environments of many kinds: scored as in a plain loop, or refused by a rule."""
 
 import copy
+import gc
+import random
+import threading
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
+from multiprocessing import Pipe
 from types import SimpleNamespace
 
 import gymnasium
@@ -18,6 +24,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
+    VecMonitor,
     VecNormalize,
 )
 from stable_baselines3.common.vec_env import VecFrameStack as Stack
@@ -25,7 +32,9 @@ from stable_baselines3.common.vec_env import VecFrameStack as Stack
 from agents import DirectNNController, PIController
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, evaluate
 from mptc_gym.evaluation import SEED
+from mptc_gym.layers import layers
 from mptc_gym.sb3 import load, make_vec_env, save, spec_of
+from mptc_gym.torch_env import MiddlePointTorchEnv
 from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers.vector import IncrementalAction as IncrementalBatch
 
@@ -132,6 +141,16 @@ class Integrator:
     act = __call__
 
 
+class Resetless:
+    """An object whose method of another name acts, and which must not be reset."""
+
+    def reset(self):
+        raise AssertionError("a reset of a trainer")
+
+    def choose(self, observations):
+        return law(observations)
+
+
 class Exploring:
     def act(self, observations, deterministic=False):
         return law(observations) + (0.0 if deterministic else 0.5)
@@ -166,6 +185,52 @@ class Acting(Network):
     def act(self, observations):
         assert isinstance(observations, np.ndarray)
         return self(torch.as_tensor(observations))
+
+
+class TensorAct(Network):
+    def act(self, observations):
+        return self(observations)
+
+
+class Exploration(Network):
+    """A module whose noise depends on its mode, by a `train` of its own."""
+
+    noisy = True
+
+    def train(self, mode=True):
+        self.noisy = mode
+        return super().train(mode)
+
+    def forward(self, seen):
+        return super().forward(seen) + 0.5 * self.noisy
+
+
+class Trainer(torch.nn.Module):
+    """A module with a training called `train`, and two ways to act."""
+
+    def __init__(self):
+        super().__init__()
+        self.network = Network()
+
+    def train(self, data):
+        raise AssertionError("a training that nobody asked for")
+
+    def reset(self):
+        raise AssertionError("a reset of a trainer")
+
+    def get_action(self, seen):
+        assert seen.dtype == torch.float32
+        assert not torch.is_grad_enabled()
+        return self.network(seen)
+
+    def in_arrays(self):
+        return lambda seen: self.network(torch.as_tensor(seen)).detach().numpy()
+
+
+def frozen_script():
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+        scripted = torch.jit.script(torch.nn.Sequential(*Network().layers).eval())
+        return torch.jit.freeze(scripted)
 
 
 def network_act(network):
@@ -293,7 +358,7 @@ RIGHT = {
     "predict behind **keywords": lambda _: (
         SimpleNamespace(predict=lambda seen, **k: Exploring().act(seen, k["deterministic"])),
         NOISY, lambda: law),
-    "act that explores on request": lambda _: (Exploring(), NOISY, lambda: law),
+    "act with an option": lambda _: (Exploring(), NOISY, lambda: lambda s: law(s) + 0.5),
     "partial that wants to explore": lambda _: (
         partial(Exploring().act, deterministic=False), NOISY, lambda: lambda s: law(s) + 0.5),
     "PI controller": lambda _: (PIController(), NOISY, lambda: PIController().act),
@@ -303,6 +368,15 @@ RIGHT = {
     "module in float64": lambda _: network(Network(torch.float64)),
     "its forward is a partial": lambda _: network(of_partial()),
     "its forward": lambda _: network((m := Network()).forward, m),
+    "other method of a module": lambda _: network((t := Trainer()).get_action, t.network),
+    "module with a train of its own": lambda _: network(Exploration()),
+    "frozen script": lambda _: (
+        f := frozen_script(), NOISY,
+        lambda: lambda seen: f(torch.as_tensor(seen)[None]).numpy()[0]),
+    "bound predict": lambda _: ((m := model_of(PPO, made())).predict, NOISY, predicting(m)),
+    "other method of an object": lambda _: (
+        (p := Resetless()).choose, NOISY, lambda: p.choose),
+    "infos listed by plant": lambda _: memory(wrappers.vector.DictInfoToList(many())),
     "a partial of a module": lambda _: network(partial(m := Network(), scale=1.0), m),
     "module with act": lambda _: network(Acting()),
     "module of dicts": lambda _: (
@@ -344,8 +418,6 @@ RIGHT = {
     "dict observations": lambda _: live(PPO, dummy(blocks), blocks),
     "PPO in IncrementalAction": lambda _: live(
         PPO, make_vec_env(NOISY, N, wrapper=VELOCITY, **SHORT), lambda: moved(made())),
-    "PPO in a VecEnv that differs": lambda _: (
-        m := model_of(PPO, make_vec_env(NOISY, N, wrapper=VELOCITY)), dummy(), predicting(m)),
     "PPO, rewards normalised": lambda _: (
         m := model_of(PPO, VecNormalize(dummy(), norm_obs=False)), NOISY, predicting(m)),
     "DQN": lambda _: live(DQN, levels(), levels),
@@ -391,7 +463,7 @@ REFUSED = {
     "tensors with gradients": (
         lambda: (lambda seen: torch.zeros(len(seen), 1, requires_grad=True), NOISY),
         r"tensor\.detach\("),
-    "no policy": (lambda: (3, NOISY), "must be a function, or an object with predict or act"),
+    "no policy": (lambda: (3, NOISY), "must be a function, .*, or an obj"),
     "a class": (lambda: (PIController, NOISY), "predict or act, not a class"),
     "controller of another actuator": (
         lambda: (PIController(u_max=6.0), NOISY), "limits of env, u_min=-10.0, u_max=10.0"),
@@ -404,22 +476,38 @@ REFUSED = {
         lambda: (DirectNNController(num_envs=2), NOISY), "num_envs=3"),
     "unknown id": (
         lambda: (law, "MiddlePointNosy-v0"), r"id of an env.*did you mean MiddlePointNoisy-v0"),
-    "another environment": (lambda: (law, "CartPole-v1"), "of MiddlePointEnv .* 'CartPole-v1'"),
+    "another environment": (lambda: (law, "CartPole-v1"), "of MiddlePointEnv .*CartPole-v1"),
     "module without forward": (lambda: (torch.nn.Module(), NOISY), "as agent.actor_mean"),
-    "predict": (lambda: (lambda seen: (law(seen), None), NOISY), "a model, not its predict"),
+    "tuple of actions and more": (
+        lambda: (lambda seen: (law(seen), None), NOISY),
+        r"returns actions alone, such as lambda o: agent\.get_action\(o\)\[0\]"),
+    "predict that returns three things": (
+        lambda: (SimpleNamespace(predict=lambda seen: (law(seen), None, None)), NOISY),
+        "policy.predict must be a method that returns actions, or actions and a state"),
+    "swapped arguments": (lambda: (made(), law), r"which comes first: evaluate\(policy, env\)"),
+    "reset with arguments": (
+        lambda: (SimpleNamespace(act=law, reset=lambda env: None), NOISY),
+        "reset must be callable without arguments, .* lambda o: agent.act"),
+    "module whose act takes tensors": (
+        lambda: (TensorAct(), NOISY), r"take NumPy arrays, .*act\(torch\.as_tensor\(o\)\)"),
+    "tensors in place of arrays": (
+        lambda: (law, wrappers.TransformObservation(made(), torch.as_tensor, None)),
+        "in NumPy, without .* NumpyToTorch"),
+    "environment in PyTorch": (
+        lambda: (law, MiddlePointTorchEnv(N)), "in NumPy, such as one of the same id or spec"),
     "no environment": (lambda: (law, 7), "env must be an id, an EnvSpec, environments, or a f"),
     "function that makes a batch": (lambda: (law, many), "where it makes many, call it"),
     "function that makes the same": (
-        lambda: (law, lambda e=made(): e), "must run the episodes of its seeds"),  # noqa: B008
+        lambda: (law, lambda e=made(): e), "makes another environment in each call"),  # noqa: B008
     "another seed": (
-        lambda: (law, odd(reset=lambda env, seed, options: env.reset(seed=5))),
-        "of its seeds, whose noise by sample"),
+        lambda: (law, odd(reset=lambda env, seed: env.reset(seed=5))),
+        "of its seeds, whose noise at sample"),
     "flattering errors": (
         lambda: (law, telling(lambda info: info | {"error": 0.1})),
-        "whose error by sample 1 is"),
+        "whose error at sample 1 is"),
     "no errors": (
         lambda: (law, telling(lambda info: {k: info[k] for k in info if k != "error"})),
-        "whose error by sample 1 is.* got None"),
+        "whose error at sample 1 is.* got None"),
     "plants that differ": (
         lambda: (law, unlike({}, {"delay": 3})), "must have the same plants"),
     "episodes that differ": (
@@ -443,19 +531,47 @@ REFUSED = {
         "allow_early_resets=T"),
     "model of other windows": (
         lambda: (model_of(PPO, made(action_window=3)), NOISY),
-        r"observation space of policy's training, .*model\.get_env\(\)\), or .*spec_of\(model"),
+        r"windows of .* \(3, 3, 0, 3\), got .*model\.get_env\(\)\), or spec_of\(model"),
+    "the same, without environments": (
+        lambda: (model_of(PPO, made(action_window=3)).policy, NOISY),
+        r"observations of policy's training, shape \(9,\) within .* got shape \(6,\)"),
     "model of windows with these bounds": (
         lambda: (model_of(PPO, made(error_window=0, output_window=3)),
                  made(setpoint_window=6, error_window=0)), "windows of policy's training"),
     "model whose IncrementalAction is forgotten": (
         lambda: (model_of(PPO, make_vec_env(NOISY, N, wrapper=VELOCITY)), NOISY),
-        "action wrappers of policy's training, .*IncrementalAction.*, got none"),
+        "wrappers of policy's training, IncrementalAction.*, got none"),
     "the same, in processes": (
         lambda: (model_of(PPO, processes(lambda: moved(made()))), NOISY),
-        "action wrappers of policy's training, .*IncrementalAction"),
+        "wrappers of policy's training, IncrementalAction.*, got none"),
+    "the same, with other increments": (
+        lambda: (model_of(PPO, make_vec_env(NOISY, N, wrapper=VELOCITY)),
+                 lambda: IncrementalAction(made())),
+        r"IncrementalAction\(0\.3, 4\.0\), got IncrementalAction\(0\.4, False\)"),
+    "the same, in a VecEnv": (
+        lambda: (model_of(PPO, make_vec_env(NOISY, N, wrapper=VELOCITY)), dummy()),
+        "wrappers of policy's training, IncrementalAction.*, got none"),
     "model whose VecNormalize is forgotten": (
         lambda: (model_of(PPO, normal(VecNormalize(dummy()))), NOISY),
-        "wrappers of policy's training, {'VecNormalize'}, got none"),
+        "wrappers of policy's training, VecNormalize, got none"),
+    "the same, in a plain batch": (
+        lambda: (model_of(PPO, normal(VecNormalize(dummy()))), make_vec_env(NOISY, N)),
+        "wrappers of policy's training, VecNormalize, got none"),
+    "what its VecNormalize wraps": (
+        lambda: ((m := model_of(PPO, normal(VecNormalize(dummy())))), m.get_env().unwrapped),
+        "wrappers of policy's training, VecNormalize, got none"),
+    "one of the plants of its VecNormalize": (
+        lambda: ((m := model_of(PPO, normal(VecNormalize(dummy())))), m.get_env().envs[0]),
+        "wrappers of policy's training, VecNormalize, got none"),
+    "model whose TransformObservation is forgotten": (
+        lambda: (model_of(PPO, dummy(scaled)), make_vec_env(NOISY, N, **SHORT)),
+        "wrappers of policy's training, TransformObservation, got none"),
+    "processes of its training": (
+        lambda: ((m := model_of(PPO, processes())), m.get_env()),
+        r"training where these cannot be copied \(SubprocVecEnv runs in .*spec_of\(model, id"),
+    "window of its training": (
+        lambda: ((m := model_of(PPO, made(render_mode="human"))), m.get_env()),
+        r"training where these cannot be copied \(MiddlePointEnv shows a window"),
 }  # fmt: skip
 
 
@@ -485,72 +601,204 @@ def test_bad_arguments_are_named(arguments, message):
         evaluate(law, **arguments)
 
 
-class TestEnvironmentsAreLeftAsTheyWere:
-    @pytest.mark.parametrize("fails", [False, True])
-    def test_flags_and_modes_are_put_back_and_new_seeds_drawn(self, fails):
+def in_file(folder):
+    return lambda: Monitor(made(), str(folder / "one"))
+
+
+# The environments of a training, made in a folder for their files.
+TRAININGS = {
+    "DummyVecEnv": lambda _: dummy(),
+    "make_vec_env": lambda _: make_vec_env(NOISY, N, seed=0, **SHORT),
+    "groups": lambda _: make_vec_env(NOISY, N, seed=0, group=N, wrapper=VELOCITY, **SHORT),
+    "VecNormalize": lambda _: VecNormalize(dummy()),
+    "VecFrameStack": lambda _: Stack(make_vec_env(NOISY, N, **SHORT), 2),
+    "VecMonitor": lambda folder: VecMonitor(dummy(), str(folder / "all")),
+    "Monitor": lambda _: dummy(lambda: Monitor(made())),
+    "Monitor with a file": lambda folder: dummy(in_file(folder), n=1),
+    "NormalizeObservation": lambda _: dummy(lambda: wrappers.NormalizeObservation(made())),
+}
+
+
+def state_of(model):
+    """Return all that a training may leave in a model and around it, by name."""
+    buffer = getattr(model, "rollout_buffer", None) or model.replay_buffer
+    state = {f"buffer {k}": v for k, v in vars(buffer).items() if isinstance(v, np.ndarray)}
+    state |= {f"weights {k}": v.numpy() for k, v in model.policy.state_dict().items()}
+    state |= {"episodes": np.array([[e["r"], e["l"]] for e in model.ep_info_buffer])}
+    state |= {"seen": model._last_obs, "numpy": np.random.get_state()[1]}  # noqa: NPY002
+    state |= {"torch": torch.get_rng_state().numpy(), "python": np.array(random.getstate()[1])}
+    for layer in layers(model.get_env()):
+        for name in ("obs_rms", "ret_rms"):
+            if statistics := getattr(layer, name, None):
+                state |= {f"{name} {k}": np.array(v) for k, v in vars(statistics).items()}
+    return state
+
+
+class TestNothingThatIsHandedOverChanges:
+    @pytest.mark.parametrize("part", [False, True], ids=["whole", "part"])
+    @pytest.mark.parametrize("algorithm", [PPO, SAC, RecurrentPPO])
+    @pytest.mark.parametrize("kind", TRAININGS)
+    def test_a_training_is_the_same_with_scores_and_without(
+        self, kind, algorithm, part, tmp_path
+    ):
+        def trained(folder, score):
+            folder.mkdir()
+            random.seed(0)
+            model = model_of(algorithm, TRAININGS[kind](folder))
+            env = model.get_env()
+            if part and not hasattr(env, "envs"):
+                pytest.skip("its environments are no environments of their own")
+            # The wrappers of all environments around one of them would not fit.
+            env = env.envs[0] if part and isinstance(env, DummyVecEnv) else env
+
+            def score_now(*_):
+                if score and model.num_timesteps in (20, 40):
+                    results.append(evaluate(model, env, episodes=2, seed=model.num_timesteps))
+                return True
+
+            model.learn(48, callback=score_now)
+            state = state_of(model)
+            model.get_env().close()
+            return state, sorted(file.read_text() for file in folder.iterdir())
+
+        results = []
+        (scored, files), (plain, plain_files) = (
+            trained(tmp_path / name, name == "scored") for name in ("scored", "plain")
+        )
+        assert len(results) == 2
+        assert np.ptp([found.mean_error for found in results]) > 1e-3
+        assert scored.keys() == plain.keys()
+        for name, value in scored.items():
+            np.testing.assert_array_equal(value, plain[name], err_msg=name)
+        rows = [[line.count(",") for line in text.splitlines()] for text in files]
+        assert rows == [[line.count(",") for line in text.splitlines()] for text in plain_files]
+
+    def test_it_is_the_same_where_an_evaluation_fails(self):
         envs = normal(VecNormalize(dummy(lambda: wrappers.NormalizeReward(made()))))
-        inner, before = envs.venv.envs[0], copy.deepcopy(vars(envs.obs_rms))
-        network = Network()
+        before = {name: value.copy() for name, value in self.numbers(envs).items()}
+        network = Exploration()
         network.layers[0].eval()
 
         def act(seen):
-            assert not any((envs.training, inner.update_running_mean, network.training))
-            return np.full((N, 1), np.nan) if fails else network.layers(seen)
+            assert not any((network.training, network.noisy, network.layers[1].training))
+            return np.full((N, 1), np.nan)
 
         network.forward = act
-        with pytest.raises(ValueError, match="finite") if fails else closing(envs):
+        with pytest.raises(ValueError, match="finite"):
             evaluate(network, envs, episodes=EPISODES)
-        assert envs.training
-        assert inner.update_running_mean
-        assert network.training
-        assert not network.layers[0].training
-        for name, value in vars(envs.obs_rms).items():
+        assert all((envs.training, network.training, network.noisy))
+        assert envs.venv.envs[0].update_running_mean
+        assert [part.training for part in network.layers] == [False, True, True]
+        for name, value in self.numbers(envs).items():
             np.testing.assert_array_equal(value, before[name])
-        assert inner.return_rms.count < 1
-        seeds = [each.unwrapped.np_random_seed for each in envs.venv.envs]
-        assert not set(seeds) & {*range(SEED, SEED + 9)}
 
-    @pytest.mark.parametrize("make", [made, many, dummy, lambda: make_vec_env(NOISY, **SHORT)])
+    @staticmethod
+    def numbers(envs):
+        statistics = vars(envs.obs_rms) | vars(envs.venv.envs[0].return_rms)
+        return {name: np.asarray(value) for name, value in statistics.items()}
+
+    @pytest.mark.parametrize(
+        "make",
+        [made, many, dummy, lambda: make_vec_env(NOISY, **SHORT),
+         lambda: SyncVectorEnv([made] * N)],
+    )  # fmt: skip
     def test_they_are_not_closed_and_may_be_scored_again(self, make):
         env = make()
-        env.close = lambda: pytest.fail("closed")
+        for layer in layers(env):
+            layer.close = lambda: pytest.fail("closed")
         first, again = (evaluate(Integrator(), env, episodes=EPISODES) for _ in range(2))
         np.testing.assert_array_equal(first.errors, again.errors)
+        for layer in layers(env):
+            del layer.close
+
+    def test_a_recorder_records_nothing(self):
+        class Recorder(wrappers.RecordVideo):
+            def __init__(self, env):
+                gymnasium.Wrapper.__init__(self, env)
+
+            def step(self, action):
+                pytest.fail("recorded")
+
+        plants = wrappers.TransformReward(Recorder(made()), abs)
+        assert evaluate(law, plants, episodes=2).travel > 1.0
+
+    def test_a_module_may_be_scored_in_several_threads(self):
+        network = Network()
+        expected = evaluate(network, NOISY, episodes=2, **SHORT).errors
+        with ThreadPoolExecutor(4) as pool:
+            score = partial(evaluate, network, NOISY, episodes=2, **SHORT)
+            results = [found.errors for found in pool.map(lambda _: score(), range(12))]
+        assert all(np.array_equal(errors, expected) for errors in results)
+        assert network.training
+        assert network.layers[1].training
+
+
+class Locked(gymnasium.Wrapper):
+    """A wrapper that cannot be copied."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.lock = threading.Lock()
+
+
+class Piped(gymnasium.Wrapper):
+    """A wrapper with a pipe, which a copy would close."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.line = SimpleNamespace(ends=[*Pipe()])
+
+
+class TestWhatCannotBeCopied:
+    @pytest.mark.parametrize("make", [
+        processes, lambda: AsyncVectorEnv([made] * N, context="fork"),
+        lambda: VecMonitor(processes()), lambda: Locked(made()), lambda: Piped(made()),
+        lambda: dummy(lambda: wrappers.TransformReward(Locked(made()), abs)),
+        lambda: made(render_mode="human"),
+    ])  # fmt: skip
+    def test_it_runs_itself_and_begins_a_new_episode(self, make):
+        with closing(make()) as env:
+            for _ in range(2):
+                found = evaluate(law, env, episodes=EPISODES)
+                assert np.ptp(found.errors) > 1e-3
+            gc.collect()
+            if isinstance(env, Piped):
+                first, second = env.line.ends
+                first.send(1)
+                assert second.recv() == 1
+            if hasattr(env, "get_attr"):
+                seeds = env.get_attr("np_random_seed")
+                env.step(np.zeros((N, 1), np.float32))
+            else:
+                seeds = [env.unwrapped.np_random_seed]
+                env.step(np.zeros(1, np.float32))
+            assert not {*seeds} & {*range(SEED, SEED + 9)}
+
+    def test_it_is_refused_without_harm_where_a_model_trains_in_it(self):
+        model = model_of(PPO, VecNormalize(processes()))
+        with closing(model.get_env()):
+            for policy in (model, model.predict):
+                with pytest.raises(ValueError, match="others like them"):
+                    evaluate(policy, model.get_env(), episodes=2)
+            assert model.get_env().training
+            model.learn(64)
+
+    def test_an_error_of_the_last_reset_is_not_hidden(self):
+        class Lost(Locked):
+            resets = 0
+
+            def reset(self, **keywords):
+                self.resets += 1
+                if self.resets > 2:
+                    raise ConnectionError("connection lost")
+                return super().reset(**keywords)
+
+        with pytest.raises(ConnectionError):
+            evaluate(law, Lost(made()), episodes=2)
 
     def test_an_error_of_their_own_is_not_hidden(self):
         with pytest.raises(ZeroDivisionError):
             evaluate(law, odd(step=lambda *_: 1 / 0), episodes=EPISODES)
-
-    @pytest.mark.parametrize("algorithm", [SAC, RecurrentPPO])
-    def test_training_goes_on_after_a_score_in_its_own_environments(self, algorithm):
-        model = model_of(algorithm, VecNormalize(dummy(n=1))).learn(48)
-        evaluate(model, model.get_env(), episodes=EPISODES)
-        (level,) = model._last_original_obs
-        assert level[3] == level[0]  # the first error of an episode is its set point
-        count = model.get_env().obs_rms.count
-        model.learn(16, reset_num_timesteps=False)
-        assert model.num_timesteps == 64
-        assert model.get_env().obs_rms.count == count + 16
-        kept = model._last_obs
-        evaluate(model.policy, dummy(), episodes=EPISODES)
-        assert model._last_obs is kept  # of others it forgets nothing
-
-
-def test_a_score_in_a_callback_spoils_no_sample_and_can_be_repeated():
-    def trained():
-        model = model_of(SAC, dummy(n=1))
-
-        def score(*_):
-            if model.num_timesteps % 20 == 0:
-                evaluate(model, model.get_env(), episodes=2)
-            return True
-
-        model.learn(64, callback=score)
-        return model.replay_buffer.observations[:64]
-
-    seen = trained()
-    assert np.isfinite(seen).all()
-    np.testing.assert_array_equal(seen, trained())
 
 
 @pytest.mark.parametrize("learns", [False, True])
@@ -565,8 +813,8 @@ def test_without_an_end_of_its_own_it_has_1200_samples():
     for limit in (None, 2000):
         plants = MiddlePointVectorEnv(N, max_episode_steps=limit)
         assert evaluate(law, plants, episodes=2).score is not None
-    endless = evaluate(law, "MiddlePoint-v0", episodes=2, max_episode_steps=-1)
-    assert endless.score is not None
+    for limit in (-1, 2000):
+        assert evaluate(law, episodes=2, max_episode_steps=limit).score is not None
     # Its spec says 1200.
     short = gymnasium.make_vec("MiddlePoint-v0", N, max_episode_steps=50)
     assert evaluate(law, short, episodes=2).score is None

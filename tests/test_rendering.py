@@ -190,6 +190,17 @@ def test_what_cannot_be_drawn_is_said(made, monkeypatch):
             draw()
 
 
+def test_a_window_is_open_as_long_as_an_environment_shows_its_pictures():
+    first, second = (MiddlePointEnv(render_mode="human") for _ in range(2))
+    for env in (first, second):
+        env.reset(seed=0)
+    first.close()
+    assert pygame.display.get_surface() is not None
+    second.step(np.zeros(1, np.float32))
+    second.close()
+    assert pygame.display.get_surface() is None
+
+
 anything = st.floats() | st.floats(-20, 20)
 
 

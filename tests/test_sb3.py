@@ -1,5 +1,6 @@
 """Tests of `mptc_gym.sb3`: the batch against DummyVecEnv, zips, and the callback."""
 
+import copy
 import zipfile
 from functools import partial
 
@@ -11,11 +12,16 @@ from gymnasium.wrappers import DelayObservation, TransformObservation
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 from mptc_gym import MiddlePointEnv, evaluate
 from mptc_gym import sb3 as ours
-from mptc_gym.evaluation import SEED
+from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.sb3 import ScoreCallback, load, make_vec_env, save, spec_of
 from mptc_gym.wrappers import IncrementalAction
 
@@ -178,7 +184,11 @@ class TestZips:
         for edited, message in (
             ("{}", "KeyError"),
             (record.replace("PPO", "PPOO"), "AttributeError"),
-            (None, "must be a zip of mptc_gym.sb3.save; others are loaded by"),
+            (
+                record.replace("MiddlePointEnv", "Nothing"),
+                "cannot be loaded here .AttributeErr",
+            ),
+            (None, "must be a zip of mptc_gym.sb3.save; load others by"),
         ):
             model.save(file)
             if edited:
@@ -186,10 +196,12 @@ class TestZips:
                     archive.writestr(ours.MEMBER, edited)
             with pytest.raises(ValueError, match=message):
                 load(file)
+        save(model, file)
         file.write_bytes(file.read_bytes()[:500])
-        for path in (file, tmp_path / "none.zip"):
-            with pytest.raises(ValueError, match="must be a zip of mptc_gym"):
-                load(path)
+        with pytest.raises(ValueError, match="must be a zip of mptc_gym"):
+            load(file)
+        with pytest.raises(ValueError, match=r"path must be an existing file, .*none\.zip"):
+            load(tmp_path / "none.zip")
 
 
 def test_spec_of_a_model_has_its_windows_and_wrappers():
@@ -201,7 +213,7 @@ def test_spec_of_a_model_has_its_windows_and_wrappers():
         parameters = env.unwrapped.parameters
         assert (parameters.action_window, parameters.output_window) == (20, 0)
         assert (parameters.delay, parameters.setpoint) == (3, "random")
-    with pytest.raises(ValueError, match="observation space of policy's training"):
+    with pytest.raises(ValueError, match="windows of policy's training"):
         evaluate(model, spec_of(model, HARD, action_window=3))
     with pytest.raises(ValueError, match="must be a model with its env"):
         spec_of(model.policy)
@@ -223,7 +235,7 @@ class TestScoreCallback:
         errors = [found.mean_error for _, found in callback.scores]
         assert callback.best.mean_error == min(errors)
         kept = load(best, device="cpu")
-        found = evaluate(kept, spec_of(kept, noisy), episodes=3, seed=SEED + 100)
+        found = evaluate(kept, spec_of(kept, noisy), episodes=3, seed=VALIDATION_SEED)
         assert found.mean_error == min(errors)
         shown = capsys.readouterr().out.splitlines()
         assert shown[0].startswith(f"128 of 192 samples: {noisy}: mean error ")
@@ -243,12 +255,42 @@ class TestScoreCallback:
     def test_statistics_of_the_training_are_handed_over(self):
         made = partial(make_vec_env, HARD, 2, max_episode_steps=40)
         model = model_of(VecNormalize(made(seed=0)))
-        own = VecNormalize(made(), training=False)
-        callback = ScoreCallback(own, every=64, episodes=2, verbose=0)
+        separate = VecNormalize(made())
+        before = vars(copy.deepcopy(separate.obs_rms))
+        callback = ScoreCallback(separate, every=64, episodes=2, verbose=0)
         model.learn(64, callback)
-        assert own.obs_rms.count == model.get_env().obs_rms.count
-        found = evaluate(model, own, episodes=2, seed=SEED + 100)
+        found = evaluate(model, model.get_env(), episodes=2, seed=VALIDATION_SEED)
         assert found.mean_error == callback.best.mean_error
+        for name, value in vars(separate.obs_rms).items():
+            np.testing.assert_array_equal(value, before[name])
+
+    @pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor])
+    def test_it_takes_the_environments_of_the_training(self, wrap):
+        def weights(score):
+            env = VecNormalize(make_vec_env(HARD, 2, seed=0, max_episode_steps=40))
+            model = model_of(env, seed=0)
+            callback = ScoreCallback(wrap(env), every=32, episodes=2, verbose=0)
+            model.learn(192, callback if score else None)
+            assert len(callback.scores) == 6 * score
+            return [weight.detach().numpy() for weight in model.policy.parameters()]
+
+        for scored, plain in zip(weights(True), weights(False), strict=True):
+            np.testing.assert_array_equal(scored, plain)
+
+    def test_it_overwrites_no_file_of_anybody(self, tmp_path):
+        best, hidden = tmp_path / "best.zip", tmp_path / ".best.zip"
+        hidden.write_text("a user's")
+        made = partial(make_vec_env, max_episode_steps=5)
+        callback = ScoreCallback(path=best, every=32, episodes=2, verbose=0)
+        model = model_of(made())
+        model.learn(32, callback)
+        model.learn(32, callback)  # may replace its own
+        first = best.read_bytes()
+        with pytest.raises(ValueError, match="path must be a file that does not exist yet"):
+            model_of(made()).learn(32, ScoreCallback(path=best, episodes=2, verbose=0))
+        assert best.read_bytes() == first
+        assert hidden.read_text() == "a user's"
+        assert {*tmp_path.iterdir()} == {best, hidden}
 
     def test_it_refuses_what_it_cannot_judge(self, tmp_path):
         with pytest.raises(ValueError, match="every must be an integer from 1"):
@@ -257,11 +299,10 @@ class TestScoreCallback:
             model_of(make_vec_env()).learn(64, ScoreCallback(path=tmp_path / "none" / "best"))
         model = model_of(VecNormalize(make_vec_env()))
         for env, message in (
-            (model.get_env(), "must not be the environments of the training"),
-            (model.get_env().venv, "must not be the environments of the training"),
+            (model.get_env().venv, "wrappers of policy's training, VecNormalize, got none"),
             (make_vec_env(), "must be wrapped as in training"),
-            ("MiddlePoint-v0", "wrappers of policy's training, {'VecNormalize'}"),
-            (one, "wrappers of policy's training, {'VecNormalize'}"),
+            ("MiddlePoint-v0", "wrappers of policy's training, VecNormalize"),
+            (one, "wrappers of policy's training, VecNormalize"),
         ):
             with pytest.raises(ValueError, match=message):
                 model.learn(64, ScoreCallback(env))

@@ -1,10 +1,14 @@
 """The environment in PyTorch: equal to that in NumPy, its draws, gradients, and no waiting."""
 
+import copy
 import gc
+import pickle
 from collections import defaultdict
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 torch = pytest.importorskip("torch", reason="it is what is tested")
 
@@ -17,7 +21,8 @@ from mptc_gym import PRESETS, MiddlePointVectorEnv  # noqa: E402
 from mptc_gym.draws import Ranges, Streams  # noqa: E402
 from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
 from mptc_gym.signals import Signals  # noqa: E402
-from mptc_gym.torch_env import MiddlePointTorchEnv  # noqa: E402
+from mptc_gym.torch_env import MiddlePointTorchEnv, make_vec  # noqa: E402
+from mptc_gym.wrappers import IncrementalAction  # noqa: E402
 from tests.conftest import MODES, random_actions, valid_arguments  # noqa: E402
 
 
@@ -298,3 +303,85 @@ def test_after_the_last_given_episode_the_first_follows_again():
     found = [env.reset(options={"signals": {"setpoint": levels}})[1]["setpoint"].item()]
     found += [env.step(torch.zeros(1, 1))[-1]["setpoint"].item() for _ in range(11)]
     assert found == [1.0] * 3 + [2.0] * 3 + [1.0] * 3 + [2.0] * 3
+
+
+class TestById:
+    def test_it_is_that_of_the_id(self):
+        env = make_vec(
+            "MiddlePointHard-v0", 3, dtype=torch.float64, delay=[2, 4], max_episode_steps=9
+        )
+        single = gymnasium.make(env.spec)
+        assert env.parameters == single.unwrapped.parameters
+        assert env.spec.id == "MiddlePointHard-v0"
+        assert env.spec.max_episode_steps == 9
+        assert env.dtype is torch.float64
+        env.reset(seed=0)
+        ended = [env.step(torch.zeros(3, 1))[3].all().item() for _ in range(9)]
+        assert ended == [False] * 8 + [True]
+
+    @pytest.mark.parametrize(
+        ("env", "named"),
+        [
+            ("MiddlePointHart-v0", "did you mean MiddlePointHard-v0"),
+            ("CartPole-v1", "spec of a MiddlePointEnv, without wrappers"),
+            (IncrementalAction(gymnasium.make("MiddlePoint-v0")).spec, "without wrappers"),
+        ],
+    )
+    def test_others_are_refused(self, env, named):
+        with pytest.raises(ValueError, match=named):
+            make_vec(env, 2)
+
+
+@pytest.mark.parametrize("differentiable", [False, True])
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
+def test_a_copy_in_mid_episode_goes_on_alike(duplicate, differentiable):
+    shown = {"action_window": 4, "move_weight": 0.1, "max_episode_steps": 50}
+    env = make(3, differentiable=differentiable, **shown, **PRESETS["hard"])
+    env.reset(seed=0)
+    weight = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
+    for _ in range(27):
+        env.step(0.7 * weight * torch.ones(3, 1, dtype=torch.float64))
+    other = duplicate(env)
+    for k in range(60):  # beyond the end of the episode
+        action = torch.full((3, 1), (-1) ** k * 0.8, dtype=torch.float64)
+        *arrays, infos = env.step(action)
+        *other_arrays, other_infos = other.step(action)
+        for array, expected in zip(other_arrays, arrays, strict=True):
+            assert torch.equal(array, expected)
+            assert not array.requires_grad
+        assert torch.equal(other_infos["noise"], infos["noise"])
+
+
+def arrays(values):
+    return {name: torch.as_tensor(each).numpy() for name, each in values.items()}
+
+
+@pytest.mark.parametrize("library", ["NumPy", "PyTorch"])
+def test_a_teacher_sees_the_plants_as_they_are(library):
+    hard = PRESETS["hard"]
+    env = MiddlePointVectorEnv(4, **hard) if library == "NumPy" else make(4, **hard)
+    zero = np.zeros((4, 1)) if library == "NumPy" else torch.zeros(4, 1, dtype=torch.float64)
+    with pytest.raises(ResetNeeded):
+        env.plant_state()
+    _, drawn = env.reset(seed=0)
+    assert not env.plant_state().load.any()
+    for k in range(130):
+        *_, infos = env.step(zero)
+        if k == 70:
+            mask = np.array([True, False, False, True])
+            _, later = env.reset(options={"reset_mask": mask})
+            assert [bool(load) for load in env.plant_state().load] == [False, True, True, False]
+            later, drawn = arrays(later), arrays(drawn)
+            drawn = {name: np.where(mask, later[name], drawn[name]) for name in drawn}
+    state = arrays(env.plant_state()._asdict())
+    for name in ("delay", "dead_zone"):
+        np.testing.assert_allclose(state[name], drawn[name], rtol=1e-12)
+    shown = copy.deepcopy(arrays(infos))
+    np.testing.assert_array_equal(state["load"], shown["disturbance"])
+    # The gain of (28) as printed, and the area above its step response.
+    np.testing.assert_allclose(state["gain"] / shown["gain_factor"], -0.04964 / 0.07273)
+    seconds = state["time_constant"] / shown["time_constant_factor"]
+    np.testing.assert_allclose(seconds, 8.0 * 20.6, rtol=2e-3)
+    infos["disturbance"] *= 0.0
+    after = arrays(env.plant_state()._asdict())
+    np.testing.assert_array_equal(after["load"], state["load"])

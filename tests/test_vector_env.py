@@ -156,3 +156,10 @@ def test_the_seed_of_each_plant_can_be_read():
 def test_it_is_a_direct_child_of_gymnasium_s():
     # By which skrl tells whose environment it is.
     assert VectorEnv in MiddlePointVectorEnv.__bases__
+
+
+def test_an_object_that_is_no_array_is_refused():
+    envs = MiddlePointVectorEnv(1)
+    envs.reset()
+    with pytest.raises(ValueError, match="actions must be numbers"):
+        envs.step(np.array(0.5, dtype=object))

@@ -22,8 +22,10 @@ from benchmarks.controllers.spec import EVERYTHING, LIMITS, ControllerSpec
 from benchmarks.lib.command import FanOut, Names, Parameter, blame, known, options
 from benchmarks.lib.errors import UsageError
 from mptc_gym import IDS, Parameters
-from mptc_gym.acting import check_fit, natives, opened, start
+from mptc_gym.acting import opened
 from mptc_gym.evaluation import case_of
+from mptc_gym.fit import check_fit
+from mptc_gym.policies import start
 
 AgentNames = Annotated[Names, Parameter(help=f"Controllers to run, of {', '.join(ROSTER)}.")]
 FORMS = (
@@ -236,7 +238,7 @@ class Policy:
         with opened(env, self.runs, self.policy, **more) as given:
             with blame("--agent"):
                 case = case_of(Parameters(**arguments))
-                if any(case_of(each.parameters) != case for each in natives(given)):
+                if any(case_of(group.parameters) != case for group in given.groups):
                     raise ValueError("the environment must have the parameters of the case")
                 check_fit(self.policy, given)
             yield given

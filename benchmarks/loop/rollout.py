@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.acting import rollout as run_batch
+from mptc_gym.adapters import Plants, adapted
 from mptc_gym.draws import Ranges
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import action_from_command, least_effective
@@ -125,8 +126,9 @@ def rollout(
     seeds = [*range(seed, seed + plants.num_envs)]
     agent.reset()
     act = partial(_watched, before, itertools.count(), agent.act) if before else agent.act
-    signals, steps = [], run_batch(plants, act, samples, seeds)
-    for (info, _), (next_info, _) in itertools.pairwise(steps):
+    adapted_plants = plants if isinstance(plants, Plants) else adapted(plants)
+    signals, steps = [], run_batch(adapted_plants, act, samples, seeds)
+    for (_, info, _), (_, next_info, _) in itertools.pairwise(steps):
         # A step reports the command and the applied flow of the sample at which it starts.
         sample = [
             info["setpoint"],

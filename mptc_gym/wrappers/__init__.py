@@ -87,9 +87,9 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         )
         gymnasium.ActionWrapper.__init__(self, env)
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
-        self._increments = max_move, compensate_dead_zone
+        self.increments = max_move, compensate_dead_zone
         self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}
-        self._actuator = Actuator(self._numbers, *self._increments)
+        self._actuator = Actuator(self._numbers, *self.increments)
         self._flow = 0.0  # wanted, t/h
 
     def reset(
@@ -98,7 +98,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         """Reset the environment, and set the wanted flow to 0."""
         observation, info = self.env.reset(seed=seed, options=options)
         numbers = self._numbers | {name: info[name] for name in NUMBERS if name in info}
-        self._actuator, self._flow = Actuator(numbers, *self._increments), 0.0
+        self._actuator, self._flow = Actuator(numbers, *self.increments), 0.0
         return observation, info
 
     def action(self, action: Any) -> NDArray[np.float32]:

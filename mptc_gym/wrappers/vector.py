@@ -11,8 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.acting import natives
 from mptc_gym.checks import many_actions, reject
+from mptc_gym.layers import plant_groups
 from mptc_gym.wrappers import NUMBERS, Actuator
 
 
@@ -35,20 +35,20 @@ class IncrementalAction(VectorActionWrapper):
         max_move: float = 0.4,
         compensate_dead_zone: bool | float = False,
     ) -> None:
-        plants = natives(env) if isinstance(env, VectorEnv) else []
-        if not plants:
+        groups = plant_groups(env) if isinstance(env, VectorEnv) else []
+        if not groups:
             kind = "a vector environment of MiddlePointEnv in NumPy"
             reject("env", env, f"{kind}; mptc_gym.wrappers takes one")
         super().__init__(env)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._increments = max_move, compensate_dead_zone
-        sizes = [getattr(each, "num_envs", 1) for each in plants]
-        self._numbers = {
-            name: np.repeat([each.parameters.range_of(name)[0] for each in plants], sizes)
-            for name in NUMBERS
-        }
-        self._actuator = Actuator(self._numbers, *self._increments)
+        self.increments = max_move, compensate_dead_zone
+        counts = [group.num_envs for group in groups]
+        self._numbers = {}
+        for name in NUMBERS:
+            lowest = [group.parameters.range_of(name)[0] for group in groups]
+            self._numbers[name] = np.repeat(lowest, counts)
+        self._actuator = Actuator(self._numbers, *self.increments)
         self._mode = AutoresetMode(env.metadata["autoreset_mode"])
         self._flows = np.zeros(self.num_envs)  # wanted, t/h
         self._ended = np.zeros(self.num_envs, np.bool_)  # to be reset by the next step
@@ -82,6 +82,6 @@ class IncrementalAction(VectorActionWrapper):
         """Set the wanted flow to 0 where an episode has begun, and store what was drawn."""
         for name in {*NUMBERS} & {*infos}:
             self._numbers[name][begun] = infos[name][begun]
-        self._actuator = Actuator(self._numbers, *self._increments)
+        self._actuator = Actuator(self._numbers, *self.increments)
         self._flows[begun] = 0.0
         self._ended = self._ended & ~begun

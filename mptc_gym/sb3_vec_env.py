@@ -1,0 +1,234 @@
+"""Step batches of plants as one `VecEnv` of Stable-Baselines3; see `mptc_gym.sb3`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, NoReturn, cast
+
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from mptc_gym.checks import MOST_PLANTS, count, reject
+from mptc_gym.making import make_batch, make_one
+from mptc_gym.wrappers import IncrementalAction
+
+
+class _Part(NamedTuple):
+    """A batch and the numbers of its environments among all."""
+
+    batch: Any  # a VectorEnv
+    numbers: slice
+
+
+class GymnasiumVecEnv(VecEnv):
+    """Step whole batches at once, where `DummyVecEnv` steps one environment after another.
+
+    All that it returns is bit for bit that of `DummyVecEnv` with the same environments, except
+    for infos: `step` lists only those of last samples, as dicts would take longer than the
+    step, and `infos` holds the latest of all in Gymnasium's form, as arrays.
+
+    Parameters
+    ----------
+    batches
+        Vector environments of autoreset mode "SameStep" and with the same spaces; their
+        environments are numbered one batch after another.
+    spec, group
+        Spec of one environment with its wrappers, if all are alike; and number of neighbours
+        that share a seed, and thus all random numbers.
+    """
+
+    def __init__(
+        self, *batches: VectorEnv[Any, Any, Any], spec: EnvSpec | None = None, group: int = 1
+    ) -> None:
+        modes = {batch.metadata.get("autoreset_mode") for batch in batches}
+        if modes != {AutoresetMode.SAME_STEP}:
+            raise ValueError(f"batches must have autoreset_mode 'SameStep', got {modes}")
+        self.batches = batches
+        self.spec = spec
+        self.group = group
+        self.infos: dict[str, Any] = {}
+        self._parts: list[_Part] = []
+        num_envs = 0
+        for batch in batches:
+            numbers = slice(num_envs, num_envs + batch.num_envs)
+            self._parts.append(_Part(batch, numbers))
+            num_envs += batch.num_envs
+        self._next_seeds: list[int | None] = [None] * num_envs
+        self._returns = np.zeros(num_envs)  # of the episode so far
+        self._lengths = np.zeros(num_envs, np.int64)
+        spaces = batches[0].single_observation_space, batches[0].single_action_space
+        super().__init__(num_envs, *spaces)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seeds of the next reset: environment i has `seed + i // group`."""
+        first = cast("int", super().seed(seed)[0])  # a random one if there is none
+        seeds = [first + index // self.group for index in range(self.num_envs)]
+        self.set_seeds(seeds)
+        return seeds
+
+    def set_seeds(self, seeds: Sequence[int]) -> None:
+        """Set the seeds of the next reset, one per environment."""
+        self._next_seeds = [*seeds]
+
+    def reset(self) -> NDArray[Any]:
+        """Reset all environments, with the seeds set by `seed`."""
+        returned = [
+            part.batch.reset(seed=self._next_seeds[part.numbers]) for part in self._parts
+        ]
+        self._next_seeds = [None] * self.num_envs
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        self.reset_infos = []
+        for part, (_, infos) in zip(self._parts, returned, strict=True):
+            self.reset_infos += [_infos_of_one(infos, i) for i in range(part.batch.num_envs)]
+        joined = _joined(returned)
+        self.infos = joined[-1]
+        return cast("NDArray[Any]", joined[0])
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Store the actions, shape (num_envs, action size)."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step with the stored actions."""
+        returned = [part.batch.step(self._actions[part.numbers]) for part in self._parts]
+        observations, rewards, terminated, truncated, self.infos = _joined(returned)
+        ended = terminated | truncated
+        self._returns += rewards
+        self._lengths += 1
+        infos: list[dict[str, Any]] = [{} for _ in ended]
+        for index in np.flatnonzero(ended).tolist():
+            place = self._place(index)
+            infos_of_batch = returned[place.part][-1]
+            infos[index] = {
+                **_infos_of_one(infos_of_batch["final_info"], place.row),
+                "terminal_observation": infos_of_batch["final_obs"][place.row],
+                "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
+                "episode": {
+                    "r": self._returns[index].item(),
+                    "l": self._lengths[index].item(),
+                },
+            }
+            self.reset_infos[index] = _infos_of_one(infos_of_batch, place.row)
+        self._returns[ended] = 0.0
+        self._lengths[ended] = 0
+        return observations, rewards.astype(np.float32), ended, infos
+
+    def get_images(self) -> list[NDArray[np.uint8]]:
+        """Return a picture of each environment, if the batch has the mode "rgb_array"."""
+        images: list[NDArray[np.uint8]] = []
+        for batch in self.batches:
+            images += cast("Any", batch.render() or ())
+        return images
+
+    def close(self) -> None:
+        """Close the batches."""
+        for batch in self.batches:
+            batch.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of each environment's batch, or the spec of one environment."""
+        places = [self._place(index) for index in self._get_indices(indices)]
+        if attr_name == "spec":
+            return [self.spec for _ in places]
+        return [getattr(self.batches[place.part], attr_name) for place in places]
+
+    def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """Refuse: an environment of a batch has no methods or attributes of its own."""
+        raise NotImplementedError(f"use `batches`, for all at once, got {args or kwargs}")
+
+    set_attr = env_method
+
+    def env_is_wrapped(
+        self, wrapper_class: type[Any], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """Return False for each index: a batch holds no wrapped environments."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _place(self, index: int) -> _Place:
+        """Return where an environment is."""
+        for number, part in enumerate(self._parts):
+            if index < part.numbers.stop:
+                return _Place(number, index - part.numbers.start)
+        raise IndexError(index)
+
+
+class _Place(NamedTuple):
+    """Where an environment is: the number of its part, and its row there."""
+
+    part: int
+    row: int
+
+
+def _joined(returned: list[tuple[Any, ...]]) -> list[Any]:
+    """Concatenate what the batches returned: their arrays, and their infos by name."""
+    *arrays, infos = zip(*returned, strict=True)
+    names = set.intersection(*map(set, infos))
+    columns = {
+        name: np.concatenate([infos_of_batch[name] for infos_of_batch in infos])
+        for name in names
+        if isinstance(infos[0][name], np.ndarray)
+    }
+    return [*map(np.concatenate, arrays), columns]
+
+
+def _infos_of_one(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
+    """Return the infos of one environment of a batch, as it would return them alone."""
+    infos_of_one = {}
+    for name, values in infos.items():
+        is_of_plant = not name.startswith("final_") and f"_{name}" in infos
+        if is_of_plant and infos[f"_{name}"][index]:
+            value = values[index]
+            infos_of_one[name] = value.item() if isinstance(value, np.generic) else value
+    return infos_of_one
+
+
+def make_vec_env(
+    env: str | EnvSpec = "MiddlePoint-v0",
+    n_envs: int = 1,
+    *,
+    seed: int | None = None,
+    group: int = 1,
+    wrapper: Mapping[str, Any] | Callable[..., Any] | None = None,
+    **arguments: Any,
+) -> GymnasiumVecEnv:
+    """Make plants that are stepped together, for the algorithms of Stable-Baselines3.
+
+    Parameters
+    ----------
+    env, **arguments
+        An id or an `EnvSpec`, and further arguments for it, as in `gymnasium.make`;
+        `render_mode` may be "rgb_array".
+    n_envs
+        Number of plants.
+    seed
+        Seed of the first plant at the first reset; plant i has `seed + i // group`. The seed of
+        a model, if it has one, replaces it.
+    group
+        Number of neighbouring plants that share a seed: they have the same noise, load and
+        set points, and differ only in what a policy explores.
+    wrapper
+        Adds `IncrementalAction`: its arguments, or the class itself for its defaults. Others
+        cannot take a batch: use `stable_baselines3.common.env_util.make_vec_env`.
+    """
+    n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
+    group = count("group", group, 1, n_envs)
+    render_mode = arguments.pop("render_mode", None)  # of the batch alone, not of its spec
+    single = make_one(env, arguments)
+    if isinstance(wrapper, Mapping):
+        single = IncrementalAction(single, **wrapper)
+    elif callable(wrapper):
+        single = wrapper(single)
+    elif wrapper is not None:
+        reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
+    mode = AutoresetMode.SAME_STEP
+    batch = make_batch(single, n_envs, autoreset_mode=mode, render_mode=render_mode)
+    if batch is None:
+        reject("env", single, "of this package, in no wrapper other than IncrementalAction")
+    plants = GymnasiumVecEnv(batch, spec=single.spec, group=group)
+    plants.seed(seed)
+    return plants
