@@ -27,8 +27,11 @@ BEHAVIOURS = {
     "smith": ("smith",),
     "mixed": ("pi", "pi-simc", "smith", "nn"),
 }
+# A set gets a new version where what it records changes. Since v1 the Smith predictor has
+# another anti-windup, and it and PI (SIMC) are tuned to an Ms of 1.6.
+VERSIONS = {"pi": 0, "smith": 1, "mixed": 1}
 IDS = {
-    f"middlepoint/{plant}/{behaviour}-v0": (plant, behaviour)
+    f"middlepoint/{plant}/{behaviour}-v{VERSIONS[behaviour]}": (plant, behaviour)
     for plant in ("paper", "disturbed", "fouling")
     for behaviour in BEHAVIOURS
 }

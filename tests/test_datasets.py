@@ -28,7 +28,7 @@ def folders(tmp_path):
 
 
 def test_a_set_is_replayed_and_scores_a_learner(minari, tmp_path, capsys):
-    name = "middlepoint/fouling/mixed-v0"
+    name = "middlepoint/fouling/mixed-v1"
     assert main([name, "--episodes", "4"]) == 0
     assert name in capsys.readouterr().out
     assert folders(tmp_path) == ["middlepoint"]  # nothing is left over
@@ -71,9 +71,9 @@ def sha256(plant, episodes):
 
 
 HASHES = {
-    "paper": ("7507286da83b5d32", "5f26ac5d91f00b6e", "59527635d8b103fc"),
-    "disturbed": ("dffa6addaa52cdfa", "2d3305dd10409894", "1465adbc556e8977"),
-    "fouling": ("a2239e92cdda32cc", "a11133192ae47718", "5b2583c36644d7b8"),
+    "paper": ("7507286da83b5d32", "46c2b5abc18730ed", "19f71d592767e520"),
+    "disturbed": ("dffa6addaa52cdfa", "b387d788d0219825", "1a5c4558413b9511"),
+    "fouling": ("a2239e92cdda32cc", "5e3828a9d903655f", "8bf844218407529a"),
 }
 
 
@@ -85,7 +85,7 @@ def test_a_published_set_is_recorded_again_bit_for_bit(plant):
 
 
 def test_writing_again_replaces_and_a_failure_changes_nothing(minari, monkeypatch, tmp_path):
-    name = "middlepoint/paper/mixed-v0"
+    name = "middlepoint/paper/mixed-v1"
     for episodes in (1, 3):  # fewer than there are controllers
         assert main([name, "--episodes", str(episodes)]) == 0
         assert minari.load_dataset(name).total_episodes == episodes

@@ -130,7 +130,9 @@ class ControllerSpec:
 
         slowest = 30.0 * (known["time_constant"] + known["delay"])
         fastest = 0.1 * known["sampling_interval"]
-        return time_constant_for(self.sensitivity, build, nominal(parameters), slowest, fastest)
+        model = nominal(parameters)
+        exact = time_constant_for(self.sensitivity, build, model, slowest, fastest)
+        return float(f"{exact:.4g}")  # the same on all machines
 
     def loop(self, plant: Mapping[str, Any]) -> LinearLoop:
         """Return the loop of the controller, if it is linear, with the nominal plant."""
