@@ -65,7 +65,7 @@ import mptc_gym  # noqa: E402 (last, since the id above must do without it)
 assert Path(mptc_gym.__file__).is_relative_to(sys.prefix), mptc_gym.__file__
 assert mptc_gym.__version__ == installed.version
 changelog = Path(mptc_gym.__file__).with_name("CHANGELOG.md").read_text(encoding="utf-8")
-assert f"## {installed.version}\n" in changelog
+assert f"## {installed.version} (" in changelog  # with a date
 idle = mptc_gym.evaluate(lambda seen: 0.0 * seen[:, :1], "MiddlePointHard-v0")
 assert abs(idle.score) < 1e-9 < idle.least_possible < idle.mean_error, idle
 print(f"mptc_gym {installed.version} is complete and runs, with nothing but {needed}")
