@@ -130,7 +130,7 @@ class TestOwnControllers:
         [
             ("def Mine(:", "--agent: .* cannot be loaded: SyntaxError"),
             ("raise SystemExit(3)", "--agent: .* cannot be loaded: SystemExit: 3"),
-            ("class Mine: pass", "policy must be a function, or an object with predict or act"),
+            ("class Mine: pass", "policy must be a function, .*, or an object with pre"),
             ("class Mine: observation = 3", "--agent: .* cannot be loaded: TypeError"),
             ("class Mine: observation = {'delay': 0}", "out of .* got {'delay': 0}"),
             (

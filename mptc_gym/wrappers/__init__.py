@@ -57,6 +57,11 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         False leaves the dead zone as it is. True compensates the plant's own, as drawn for the
         episode where it is a range. A number compensates a dead zone of that half width, t/h.
 
+    Attributes
+    ----------
+    increments : (float, bool or float)
+        `max_move` and `compensate_dead_zone`.
+
     Raises
     ------
     ValueError
