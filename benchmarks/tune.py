@@ -106,13 +106,13 @@ def work(options: Options) -> str:
 
     name, made = options.controller, origin()
     plant = options.plant.arguments()
+    names = [*spans_of(ROSTER[name], plant)]
     target = options.out / name
     with results_folder(target, conditions_of("tune", options)) as folder:
         trials = pd.DataFrame(search(name, plant, options.trials, options.runs, folder))
         table = finals(name, plant, trials)
         samples = options.runs * sum(case.samples for case in cases(plant).values())
         budget = f"{len(trials)} trials: {len(trials) * samples / 1e6:.0f} M samples"
-        names = [*spans_of(ROSTER[name], plant)]
         content = {
             "controller": name,
             "gains": table.loc[0, names].to_dict(),

@@ -275,7 +275,7 @@ class TestLeastPossible:
         with pytest.raises(np.linalg.LinAlgError):
             least_possible(samples=1201, **case)
         with pytest.raises(np.linalg.LinAlgError):
-            command.row(Scenario("a", "b", 1201, case), 1201, {"episodes": 1, "seed": 0}, None)
+            command.row(Scenario("a", "b", 1201, case), command.Options(episodes=1, seed=0))
         with pytest.raises(np.linalg.LinAlgError):
             sweep.scale_of({**case, "delay": 17}, 1)
 

@@ -152,7 +152,7 @@ def test_without_cyclopts_a_command_names_the_extra(name):
 def test_the_map_shows_the_questions_runs_a_command_or_names_the_one_meant(refused, capsys):
     assert show_map([]) == 0
     shown = capsys.readouterr().out
-    assert "Which gains are best?\n    python -m benchmarks.tune nn\n" in shown
+    assert "Which gains are best for a controller?\n    python -m benchmarks.tune nn\n" in shown
     assert "](" not in shown
     assert show_map(["compare", "--help"]) == 0
     assert capsys.readouterr().out.startswith("Usage: python -m benchmarks.compare")

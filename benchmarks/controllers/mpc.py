@@ -4,7 +4,6 @@ It shows how close a controller can come to the bounds of `benchmarks.bounds`.
 """
 
 import numpy as np
-import scipy  # loads its modules on first use
 from numpy.typing import NDArray
 
 from agents.actuator import applied_flow, float32_action
@@ -54,12 +53,14 @@ def hedged_setpoints(setpoint: Array, held: Array, amplitude: float, deviation: 
 
     The left side rises with r, so bisection finds it. All arguments broadcast together.
     """
+    from scipy.special import ndtr  # here: slow to import
+
     deviation = np.maximum(deviation, TINY)  # without noise the normal law becomes a step
     shape = np.broadcast_shapes(*map(np.shape, (setpoint, held, deviation)))
     low, high = np.full(shape, -amplitude), np.full(shape, amplitude)
     for _ in range(BISECTIONS):
         r = (low + high) / 2.0
-        below_level = scipy.special.ndtr((r - setpoint) / deviation)
+        below_level = ndtr((r - setpoint) / deviation)
         upper = _integral_of_phi((r + amplitude) / deviation)
         lower = _integral_of_phi((r - amplitude) / deviation)
         below_next = deviation * (upper - lower) / (2.0 * amplitude)
@@ -71,8 +72,10 @@ def hedged_setpoints(setpoint: Array, held: Array, amplitude: float, deviation: 
 
 def _integral_of_phi(z: Array) -> Array:
     """Return the integral of the standard normal distribution function up to z."""
+    from scipy.special import ndtr  # here: slow to import
+
     density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
-    return np.asarray(z * scipy.special.ndtr(z) + density)
+    return np.asarray(z * ndtr(z) + density)
 
 
 class PredictiveController:
