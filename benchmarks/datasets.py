@@ -200,7 +200,7 @@ def _create(name: str, episodes: list[Episode]) -> str:
     )
     return (
         f"mean |e| {mean_error:.3f} °C, least possible {least_error:.3f}, "
-        f"no control {idle.mean_error:.3f}"
+        f"idle valve {idle.mean_error:.3f}"
     )
 
 

@@ -33,19 +33,20 @@ if TYPE_CHECKING:
 SAMPLES = 1200  # of a run
 SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
 SEED = SEEDS["studies"].first  # of a plant's first run, and of the bootstraps
-OSCILLATES = 1.0  # degC by which the swing must exceed that without control
+OSCILLATES = 1.0  # degC by which the swing must exceed that with an idle valve
 COLUMNS = {  # of the overview: headings and formats
-    "multiple": ("multiple, median", "{:.3f}"),
-    "multiple_p90": ("multiple, 90 %", "{:.3f}"),
+    "multiple": ("error ratio, median", "{:.3f}"),
+    "multiple_p90": ("error ratio, 90 %", "{:.3f}"),
     "travel": ("travel (t/h)", "{:,.0f}"),
     "oscillates": ("oscillates (%)", "{:.1f}"),
-    "useless": ("no better than no control (%)", "{:.1f}"),
+    "useless": ("no better than an idle valve (%)", "{:.1f}"),
 }
 TEXT = (
-    "Multiple: mean error / least possible error, the median and 90th percentile over the "
-    "plants (the median run of each). Travel: of the valve in a run, the median. Oscillates: "
-    f"on steady stretches the standard deviation of the error is {OSCILLATES:g} °C larger "
-    "than without control. This, and no better than no control, are shares of the runs."
+    "The error ratio is the mean error divided by the least possible error. The table gives "
+    "its median and its 90th percentile over the plants, each with its median run. Travel is "
+    "the valve travel of the median run. A run oscillates if the standard deviation of the "
+    f"error on steady stretches is {OSCILLATES:g} °C larger than with an idle valve. The last "
+    "two columns are shares of the runs."
 )
 PICTURE = "The error of each controller on each plant, relative to the lowest achievable error"
 GROUPS = {  # of the plants of a random design, a row each
@@ -165,7 +166,7 @@ def run_agent(
 
 
 def scale_of(case: Arguments, runs: int) -> dict[str, Any]:
-    """Run no control on a plant; add the reference (`limit`), NaN if there is none."""
+    """Run an idle valve on a plant; add the reference (`limit`), NaN if there is none."""
     from benchmarks.bounds.least import least_possible
 
     found = {**run_agent(ROSTER["idle"], case, case, runs), "limit": math.nan}
@@ -201,7 +202,7 @@ def table(
         idle = results.get(f"plant {i}")
         measures = results.get(f"plant {i}, {agent}")
         if idle and measures:
-            comparisons = {  # with no control in the same noise
+            comparisons = {  # with an idle valve in the same noise
                 "limit": idle["limit"],
                 "ratio": measures["mae"] / idle["limit"],
                 "oscillates": measures["swing"] > idle["swing"] + OSCILLATES,

@@ -23,14 +23,15 @@ from mptc_gym.evaluation import (
 HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
 HIDDEN = "hidden load (estimate)"
 NOTE = (
-    "With preview: no controller does better on average, even one that knows the set point "
-    "beforehand. Without: none that learns of a change of the set point when it happens; for "
-    "random set points alone, which have a law. Reference: the same, if each change finds the "
-    "plant settled; a controller that counts samples can come below it. Where a set point "
-    "never changes, the three are the same. All of them know the load as soon as it changes. "
-    "Hidden load: an estimate, not a bound, for controllers that see the load through the "
-    "transmitter alone, from the reference or, for random set points, from the bound without "
-    "preview. 95 % intervals over drawn episodes."
+    "'With preview' is a lower bound for every controller, even one that knows all set points "
+    "in advance. 'Without preview' is a lower bound for controllers that see a change only "
+    "when it happens; it exists for random set points, whose distribution is known. "
+    "'Reference' is the lowest error if the plant has settled before each change and the "
+    "change comes as a surprise; a controller that knows when the changes come can do better. "
+    "If the set point never changes, the three are the same. All of them assume that the "
+    "controller knows the present load. 'Hidden load' is an estimate, and no bound, for "
+    "controllers that see the load only through the transmitter. Intervals are 95 % intervals "
+    "over sampled episodes."
 )
 PACKAGE = ROOT / "mptc_gym" / "bounds.json"
 MORE = 20  # episodes of the package beyond those of a score, which `ScoreCallback` runs
@@ -68,7 +69,7 @@ def work(options: Options) -> str:
     if options.package:
         return write_package(options.fan_out)
     tasks = {name: partial(row, case, options) for name, case in cases.items()}
-    headings = ["no control", *HEADINGS.values(), HIDDEN]
+    headings = ["idle valve", *HEADINGS.values(), HIDDEN]
     if options.mpc:
         headings.append("MPC")
     print(", ".join(filter(None, ["Mean |e| in °C", options.plant.name])) + ":")

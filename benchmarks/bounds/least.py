@@ -46,13 +46,13 @@ class LeastPossible(Estimate):
     """
 
     kind: str  # one of `KINDS`
-    idle: Estimate  # mean |e| of the same episodes without control, degC
+    idle: Estimate  # mean |e| of the same episodes with an idle valve, degC
     # Terms of the mean, degC; element i is for the episode of seed `seed + i`. For the kind
     # "causal" only their mean is a bound.
     episodes: tuple[float, ...]
 
     def score(self, errors: ArrayLike) -> Array:
-        """Return scores of mean errors, degC: 0 without control, 1 for `value`.
+        """Return scores of mean errors, degC: 0 for an idle valve, 1 for `value`.
 
         A single run may exceed 1 by chance. A ValueError is raised if nothing is better than no
         control.

@@ -24,26 +24,34 @@ from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES
 
 BOOTSTRAP = 0  # seed of the bootstraps
-SCORE = "Mean over the cases, 95 % interval; valve travel is the mean over all runs."
+SCORE = (
+    "A score is the mean over the cases, with its 95 % interval. Valve travel is the mean over "
+    "all runs."
+)
 BOUND = (
-    "Least possible without foresight; where marked *, if each change of the set point finds "
-    "the plant settled. A controller that knows the timetable can be between the two."
+    "The first row is the least possible error of controllers without foresight. Where it is "
+    "marked *, the plant has settled before each change of the set point; a controller that "
+    "knows when the changes come can do better, down to the second row."
 )
 ANTICIPATES = (
-    "‡ moves before the square wave changes, so its score in this case is that of runs with "
-    "the same seeds in which nobody can foresee the changes."
+    "‡ The controller moves before the square wave changes. Its score in this case is that of "
+    "runs with the same seeds in which nobody can foresee the changes."
 )
 SURPRISED = (
-    "These controllers move before the square wave changes, by the share of the change that is "
-    "given. On the published square wave any controller that knows its period can reach the "
-    "error with foresight. Where levels hold for times that nobody can foresee, the error is "
-    "compared with the least possible there."
+    "These controllers move before the square wave changes. The table shows how much of the "
+    "change they have made before they can have seen it. A controller that knows the period of "
+    "the square wave can reach the error with foresight. The last column divides the error in "
+    "runs whose changes nobody can foresee by the least possible error of these runs."
 )
-PAIRED = "Below 0 a controller is better; in % the share of runs in which it is."
+PAIRED = (
+    "A number below 0 means that the controller is better. The percentage is the share of runs "
+    "in which it is better."
+)
 ROBUST = (
-    "Ms, the largest sensitivity, and the range of delays around the plant's with which the "
-    "loop is stable: of linear controllers with the nominal plant of the first case, away from "
-    "the dead zone and the limits. SIMC, Smith and Dahlin are tuned to the same Ms."
+    "Linear controllers have an Ms, the largest magnitude of the loop's sensitivity, and a "
+    "range of delays with which the loop is stable. Both are computed for the nominal plant "
+    "of the first case, away from the dead zone and the limits. PI (SIMC), Smith and Dahlin "
+    "are tuned to the same Ms."
 )
 MARK = "†"  # of controllers that were made for another plant
 PARTS = {
@@ -143,7 +151,7 @@ def estimate(
 ) -> pd.DataFrame:
     """Return estimates with 95 % intervals, one row for each case and agent.
 
-    They are the `mean` of |e|, degC; `ratio`, the mean as a multiple of `limit`, the least
+    They are the `mean` of |e|, degC; `ratio`, the mean divided by `limit`, the least
     possible error; `difference`, the mean paired difference from the first agent; and
     `improvement`, the probability of doing better than that agent, where ties count half.
     `preview` is the least possible error with foresight, `scores` those of the runs, an array:
@@ -309,7 +317,7 @@ def report(
     titles = {name: scale.scenario.title for name, scale in scales.items()}
     sections = [
         Section(
-            "Score: 0 without control, 1 at the least possible error",
+            "Score: 0 for an idle valve, 1 for the least possible error",
             [SCORE, *sorted(notes), *not_ranked],
             score_table(runs, estimates, scores, misfits),
             {
@@ -319,7 +327,7 @@ def report(
             },
         ),
         Section(
-            "Mean error as a multiple of the least possible, with its 95 % interval",
+            "Error ratio: mean error / least possible error, with its 95 % interval",
             [BOUND],
             ratio_table(estimates, scales, [*scores]),
         ),
@@ -331,7 +339,7 @@ def report(
         Section(f"Difference to {label(reference)} (°C), 95 % interval", [PAIRED], paired),
         Section(
             "Where the error arises: hard",
-            ["Contributions to the mean error, °C: means of all runs."],
+            ["The columns are the contributions of parts of the run to the mean error, in °C."],
             parts.rename_axis("controller").reset_index(),
         ),
         Section(
@@ -372,8 +380,8 @@ def anticipation_table(
                 "mean error (°C)": f"{row['mean'].value:.3f}",
                 "without foresight": f"{row['limit']:.3f}",
                 "with foresight": f"{row['preview']:.3f}",
-                "multiple": f"{row['ratio'].value:.2f}",
-                "multiple where changes surprise": f"{found.ratio:.2f}",
+                "error ratio": f"{row['ratio'].value:.2f}",
+                "error ratio where changes surprise": f"{found.ratio:.2f}",
             }
         )
     return pd.DataFrame(rows)
@@ -405,7 +413,7 @@ def score_table(
 def ratio_table(
     estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
 ) -> pd.DataFrame:
-    """Return the least possible errors, and the mean errors as multiples of these."""
+    """Return the least possible errors, and the mean errors divided by them."""
     bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
     for name, scale in scales.items():
         mark = "*" * (scale.least.kind == "reference")
