@@ -3,20 +3,23 @@
 from agents.controller import Controller
 from agents.direct_nn import DirectNNController, Weights
 from agents.networks import Increments, PolicyNetwork
-from agents.neural_law import LawNetwork, NeuralSmithPredictor
-from agents.neural_self_tuning import NeuralSelfTuningController
 from agents.pi import PIController, SmithPredictor
-from agents.self_tuning import SelfTuningController
+from agents.recurrent import RecurrentNetwork
+from agents.self_tuning import (
+    NeuralSelfTuningController,
+    NeuralSmithPredictor,
+    SelfTuningController,
+)
 
 __all__ = [
     "Controller",
     "DirectNNController",
     "Increments",
-    "LawNetwork",
     "NeuralSelfTuningController",
     "NeuralSmithPredictor",
     "PIController",
     "PolicyNetwork",
+    "RecurrentNetwork",
     "SelfTuningController",
     "SmithPredictor",
     "Weights",

@@ -57,9 +57,9 @@ QUESTIONS = {  # about pairs of controllers: does the first make the smaller err
         ("nn-frozen", "pi-simc"),
     ),
     "What does adaptation buy?": (
-        ("nn-self-tuning", "nn-smith"),
-        ("nn-self-tuning", "self-tuning"),
-        ("nn-smith", "smith"),
+        ("neural-self-tuning", "neural-smith"),
+        ("neural-self-tuning", "self-tuning"),
+        ("neural-smith", "smith"),
         ("self-tuning", "smith"),
     ),
 }

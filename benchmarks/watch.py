@@ -15,7 +15,7 @@ from benchmarks.lib.storage import UsageError, out_folder, replacing
 from benchmarks.loop.rollout import held
 from benchmarks.loop.scenarios import SCENARIOS, PlantOptions, Scenario
 
-REFERENCE = ROSTER["nn-smith"]  # whose errors those of the film are multiples of
+REFERENCE = ROSTER["neural-smith"]  # whose errors those of the film are multiples of
 PICTURES = 60  # of a film, after the first
 STYLE: Any = {"font.size": 15, "axes.spines.top": False, "axes.spines.right": False}
 

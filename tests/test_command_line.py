@@ -83,7 +83,7 @@ REFUSED = {
         (["--plants", "10"], "--plants and --design-seed are for --design random"),
         (["--out", __file__], "cannot be written to: File exists"),
     ],
-    "train": [(["pi"], '"pi" for NETWORK. Choose from: "nn-smith", "ppo"')],
+    "train": [(["pi"], '"pi" for NETWORK. Choose from: "neural", "ppo"')],
     "watch": [
         (["--agent", "pi=none"], "--agent: .pi=none. must be .*; .pi. is taken"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
@@ -114,7 +114,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_run_or_written(
     ("given", "package", "extra"),
     [
         ("datasets", "minari", "data"),
-        ("train nn-smith", "torch", "torch"), ("tune pi", "optuna", "bench"),
+        ("train neural", "torch", "torch"), ("tune pi", "optuna", "bench"),
         ("claims --backend ray", "ray", "ray"),
     ],
 )  # fmt: skip

@@ -246,7 +246,7 @@ class TestCompare:
 
     @pytest.mark.usefixtures("undrawn")
     def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):
-        out = compared("--presets --runs 2 --scenarios randomised --agents nn nn-smith")
+        out = compared("--presets --runs 2 --scenarios randomised --agents nn neural-smith")
         runs = pd.read_csv(out / "runs.csv").set_index("agent")
         estimates = pd.read_csv(out / "estimates.csv").set_index("agent")
         for agent in estimates.index:

@@ -10,8 +10,8 @@ from benchmarks.lib.command import Count, FanOut, Folder, Parameter, command, op
 from benchmarks.lib.storage import Kept, out_folder, replacing
 
 SEED = 10_000  # of the first network; the others follow
-# Modules with the recipes, and how many networks are trained by default.
-NETWORKS = {"nn-smith": ("through_plant", 1), "ppo": ("ppo", 5), "ppo-hard": ("ppo", 5)}
+# Modules with the recipes.
+NETWORKS = {"neural": "neural", "ppo": "ppo", "ppo-hard": "ppo"}
 
 
 @options
@@ -25,9 +25,8 @@ class Options:
 
     network: Annotated[str, Parameter(choices=NETWORKS)] = field(kw_only=False)
     """What to train."""
-    networks: Count | None = None
-    """Networks to train, each from its own seed (default: 1 for nn-smith, where validation
-    chooses the best; 5 for PPO, which are all compared)."""
+    networks: Count = 5
+    """Networks to train, each from its own seed. All are compared, none is chosen."""
     steps: Count | None = None
     """Optimiser steps or, for PPO, samples of experience (default: as published)."""
     out: Folder = Path("results/networks")
@@ -41,11 +40,10 @@ def work(options: Options) -> str:
     from benchmarks.lib.report import on_screen
 
     out, name = out_folder(options.out), options.network
-    module_name, usual = NETWORKS[name]
-    module = importlib.import_module(f"benchmarks.train.{module_name}")
+    module = importlib.import_module(f"benchmarks.train.{NETWORKS[name]}")
     recipe = module.RECIPES[name]
     recipe = replace(recipe, steps=options.steps or recipe.steps)
-    seeds = range(SEED, SEED + (options.networks or usual))
+    seeds = range(SEED, SEED + options.networks)
     tasks = {f"seed {seed}": partial(module.train, recipe, seed) for seed in seeds}
     trained = dict(options.fan_out.stream(tasks, "training", Kept(out / "tasks")))
     networks = {seed: trained[f"seed {seed}"] for seed in seeds}
@@ -57,10 +55,6 @@ def work(options: Options) -> str:
     shown = pd.DataFrame.from_dict(rows, "index").map("{:.4g}".format)
     print(on_screen(shown.reset_index(names="seed")))
     files = {f"{name}-{seed}": network for seed, network in networks.items()}
-    if name == "nn-smith":
-        best = min(rows, key=lambda seed: rows[seed]["all"])
-        files = {name: networks[best]}
-        print(f"Validation chooses seed {best}")
     for stem, network in files.items():
         with replacing(out / f"{stem}.npz") as file:
             network.save(file)
