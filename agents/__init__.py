@@ -4,10 +4,13 @@ from agents.controller import Controller
 from agents.dahlin import DahlinController
 from agents.direct_nn import DirectNNController, Weights
 from agents.networks import Increments, PolicyNetwork
-from agents.neural_law import LawNetwork, NeuralSmithPredictor
-from agents.neural_self_tuning import NeuralSelfTuningController
 from agents.pi import PIController
-from agents.self_tuning import SelfTuningController
+from agents.recurrent import RecurrentNetwork
+from agents.self_tuning import (
+    NeuralSelfTuningController,
+    NeuralSmithPredictor,
+    SelfTuningController,
+)
 from agents.smith import SmithPredictor
 
 __all__ = [
@@ -15,11 +18,11 @@ __all__ = [
     "DahlinController",
     "DirectNNController",
     "Increments",
-    "LawNetwork",
     "NeuralSelfTuningController",
     "NeuralSmithPredictor",
     "PIController",
     "PolicyNetwork",
+    "RecurrentNetwork",
     "SelfTuningController",
     "SmithPredictor",
     "Weights",

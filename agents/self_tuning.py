@@ -1,308 +1,218 @@
-"""Implement a self-tuning controller, which identifies the plant while controlling it."""
+"""Implement controllers that identify the plant while they control it, by a bank of models."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, ClassVar
+import math
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.actuator import applied_flow, avoid_dead_zone
-from agents.controller import Count, Index, ModelBasedController, Positive
+from agents.bank import Bank, Prior
+from agents.controller import Index, ModelBasedController
+from agents.law import OUTPUTS, Law, Observer
+from agents.recurrent import RecurrentNetwork
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
-# Time constants in the bank, as multiples of the step test's; the average lies between them.
-TIME_CONSTANTS = (0.5, 0.7, 1.0, 1.4, 2.0)
-# Dead zones in the bank: offsets from the given one, and their prior standard deviation, as
-# shares of the larger limit.
-ZONES = (-0.5, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
-ZONE_SPREAD = 0.2
-NOISE_SAMPLES = 30.0  # weight of the expected noise, in samples: the first errors are few
-GAINS = (0.3, 3.0)  # estimates stay between these multiples of the step test's gain
-# Pole of the prefilter, which removes dynamics that are too fast for first-order models.
-PREFILTER_POLE = 0.6
-LEAST_NOISE = 0.02  # degC; smaller errors come from the models' low order, and tell nothing
-EXCITED = 0.05  # of half the range: a flow that moves less does not show the gain
-MEMORY = 20  # samples before the longest delay in which a movement still shows: a time constant
-BIAS_RATE = 0.005  # per sample, of the offset estimate: slow, so as not to fight the loop
-DISTURBANCE_POLE = 0.5  # of the disturbance filter: noise of one sample moves the valve little
-UNLIKELY = -60.0  # logarithm of a probability that is as good as 0: tiny floats are slow
-MOST_DELAY = 10_000  # samples; with more, the bank would be too large for any computer
-_ROOM = 64  # samples until the histories are shifted back: at each sample it would be slow
+TIME_CONSTANTS: Final = np.array([0.63, 1.0, 1.55])  # in the bank, multiples of the step test's
+# Delays in the bank where no range is given, as multiples of the step test's, and the standard
+# deviation of their prior.
+DELAYS: Final = (0.33, 2.0)
+DELAY_SPREAD: Final = 0.33
+GAIN_SPREAD: Final = 0.25  # standard deviation of the gain, as a share of the step test's
+EXACT: Final = 1e-3  # the same where the gain is not estimated
+MOST_DELAYS: Final = 10_000  # in the bank; with more, it would be too large for any computer
+CLEARANCE: Final = 1e-4  # of half the range, by which float32 flows clear the dead zone
+SLOWEST: Final = 45.0  # samples, the greatest time constant that needs no slower sampling
 
 
 @dataclass(eq=False, kw_only=True)
 class SelfTuningController(ModelBasedController):
-    """A predictive controller that identifies the plant while controlling it.
+    """A predictive controller that identifies the plant while it controls it.
 
-    *Identification.* A bank holds one model `y(k) = g s(k - d)` for each combination of a delay
-    d, a time constant and a dead zone; s is the response of a first-order plant, with gain 1
-    and no delay, to the flow that this dead zone and the limits let pass. The gains g are
-    estimated by recursive least squares with exponential forgetting, on prefiltered signals. A
-    model's probability depends on how well it fits and how close it is to the step test. The
-    controller uses the average of all models (D. T. Magill, "Optimal adaptive estimation of
-    sampled stochastic processes", IEEE Transactions on Automatic Control 10, 1965, 434-439).
+    A bank of models with different delays and time constants runs in parallel with the plant.
+    Each model estimates its gain, and is weighted by how well it predicts (D. T. Magill,
+    "Optimal adaptive estimation of sampled stochastic processes", IEEE Transactions on
+    Automatic Control 10, 1965, 434-439); see `agents.bank.Bank`. As in a Smith predictor, the
+    mean model tells the response to past flows before it shows. What it does not explain is
+    taken for a load and forecast; see `agents.law.Law`.
 
-    *Control.* As in a Smith predictor, the model predicts the output at the end of the delay.
-    What it misses now, the disturbance, is added. It decays over the delay like the plant's own
-    response, except for its slow mean: the offset that a steady load leaves fades with about
-    200 samples. The command is `u = s + K (y_d - predicted output)`, where K makes the error
-    decay with the requested time constant. The flow after the actuator moves s, which replaces
-    an integral, so nothing winds up.
-
-    *Safeguards* (K. J. Astrom and B. Wittenmark, "Adaptive Control", 2nd edition, 1995,
-    chapter 11). The step test's gain is a prior that is never forgotten: without new
-    information, estimates return to it (M. E. Salgado, G. C. Goodwin and R. H. Middleton,
-    "Modified least squares algorithm incorporating exponential resetting and forgetting",
-    International Journal of Control 47, 1988, 477-491). While the flow stands still, nothing is
-    learnt and nothing is forgotten. All models are stable, and keep the sign of the gain. A new
-    design is adopted gradually.
+    A command is 0 or outside the dead zone, so the models know the flow that passes. All
+    quantities are scaled, so the controller serves plants of either sign, with any limits and
+    any sampling interval. With a time constant of 90 samples and more, it acts at every second
+    sample or less often.
 
     The other parameters are those of `ModelBasedController`.
 
     Parameters
     ----------
     dead_zone
-        Best guess of the half width of the actuator's dead zone, t/h. The bank holds this one
-        and up to seven around it; for the default of 0, three above it.
-    shortest_delay_samples, longest_delay_samples
-        Delays that the plant may have, in samples, at most 10,000; like `delay`, they include
-        the one sample that any input takes to show.
-    closed_loop_time_constant
-        Time constant of the closed loop, as a share of the identified one of the plant.
-    forgetting
-        Forgetting factor per sample, above 0 and at most 1; 1 forgets nothing.
+        The greatest half width that the dead zone may have, t/h.
+    delay_range
+        Shortest and longest delay that the plant may have, s, including the one sample that any
+        input takes to show; they are then equally likely. By default the delay is from a third
+        to twice that of the step test, and the more likely the nearer.
     setpoint_index, error_index
         Indices of y_d(k) and e(k), degC, in the observation.
     """
 
-    shortest_delay_samples: Count = 7
-    longest_delay_samples: Count = 37
-    closed_loop_time_constant: Positive = 0.15
-    forgetting: Positive = 0.996
+    delay_range: tuple[float, float] | None = None
     setpoint_index: Index = 0
     error_index: Index = 3
-
-    _precision: ClassVar[Any] = np.float64  # of the bank
-    _delay_step = 2  # samples between neighbouring delays in the bank
-    _clearance = 0.2  # t/h by which commands clear the dead zone
-    # How fast the control law follows the evidence.
-    _every = 10  # samples between designs
-    _share = 0.5  # of a new design that is adopted
-    _caution = 0.5  # factor of the log-likelihood, as the errors are not quite white
-    # Uncertainty of the step test: standard deviations of the gain, as a share of it, of the
-    # delay, in samples, and of the time constant's logarithm.
-    _gain_spread, _delay_spread, _time_constant_spread = 0.5, 8.0, 0.5
-    _noise = 0.5  # degC, expected
-    # Zero of the prefilter: 0.92 whitens the noise; closer to 1, a load change is less likely
-    # to be mistaken for a different gain.
-    _prefilter_zero = 0.92
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
-        least, most = self.shortest_delay_samples, self.longest_delay_samples
-        if not least <= most <= MOST_DELAY:
-            allowed = f"from shortest_delay_samples = {least} to {MOST_DELAY:,}"
-            raise ValueError(f"longest_delay_samples must be {allowed}, got {most!r}")
-        if self.forgetting > 1.0:
-            raise ValueError(f"forgetting must be above 0, up to 1, got {self.forgetting!r}")
-        limit = max(abs(self.u_min), abs(self.u_max))
-        zones = self.dead_zone + limit * np.array(ZONES)
-        self._zones = zones[(zones == self.dead_zone) | (zones >= 0.0) & (zones < limit)]
+        self._edge = self.dead_zone
+        # A slow plant is sampled less often, so that it looks like those of the training.
+        constant = self.time_constant / self.sampling_interval
+        self._every = max(1, int(constant / SLOWEST))
+        self._constant = constant / self._every
+        self._unit_flow = math.copysign((self.u_max - self.u_min) / 2.0, self.gain)  # t/h
+        self._authority = self.gain * self._unit_flow  # degC
+        self._delays, self._log_probabilities = self._delay_prior()
 
-        # Undelayed responses differ in dead zone and pole, models also in delay, the longest
-        # one first, as in the history of the responses.
-        self._delays = np.arange(most - 1, least - 2, -self._delay_step)  # d in (28)
-        nominal = self.time_constant / self.sampling_interval
-        self._constants = np.tile(nominal * np.array(TIME_CONSTANTS), len(self._zones))
-        self._poles = np.exp(-1.0 / self._constants)
-        self._dead_zones = np.repeat(self._zones, len(TIME_CONSTANTS))
-        fading = self._poles ** self._delays[:, np.newaxis]
-        self._fading = fading.ravel().astype(self._precision)
-        off_delay = (self._delays - (self._delay_samples - 1.0)) / self._delay_spread
-        off_constant = np.log(self._constants / nominal) / self._time_constant_spread
-        off_zone = (self._dead_zones - self.dead_zone) / (ZONE_SPREAD * limit)
-        off = np.square(off_delay)[:, np.newaxis] + np.square(off_constant) + off_zone**2
-        # Log-probabilities, up to a constant.
-        self._prior = -0.5 * off.ravel().astype(self._precision)
-        self._history = most - 1 + max(MEMORY, self._every) + 2
+    def _delay_prior(self) -> tuple[NDArray[np.intp], Array]:
+        """Return the delays d of the bank, samples, and the logs of their probabilities."""
+        interval = self.sampling_interval * self._every
+        likely = self.delay / interval
+        shortest, longest = DELAYS[0] * likely, DELAYS[1] * likely
+        if self.delay_range is not None:
+            shortest, longest = (limit / interval for limit in _check_range(self.delay_range))
+        first = max(math.floor(shortest + 0.5) - 1, 0)
+        last = max(math.floor(longest + 0.5) - 1, first)
+        count = last - first + 1
+        if count > MOST_DELAYS:
+            raise ValueError(
+                f"delay_range must hold at most {MOST_DELAYS:,} samples, got {count:,}"
+            )
+        delays = np.arange(first, last + 1)
+        if self.delay_range is not None:
+            return delays, np.zeros(count)
+        off = (delays + 1.0 - likely) / max(DELAY_SPREAD * likely, 1.0)
+        return delays, -0.5 * np.square(off)
 
     @property
     def estimates(self) -> dict[str, Array]:
-        """Current estimates of the plants, averaged over the models, each of shape (batch,).
+        """Estimates of the plants, means over the models, each of shape (batch,).
 
-        `gain` (degC per t/h), `time_constant` (s), `delay` (s, as in the constructor) and
-        `dead_zone` (t/h, the most likely one). Empty before the first observation.
+        `gain` (degC per t/h), `time_constant` (s) and `delay` (s, as in the constructor). Empty
+        before the first observation.
         """
-        if not self._loops:
+        if self._k == 0:
             return {}
-        constant, delay = self._by_response @ self._constants, self._by_delay @ self._delays
+        estimate, interval = self._bank.estimate, self.sampling_interval * self._every
         return {
-            "gain": self._sums.sum(1),
-            "time_constant": constant * self.sampling_interval,
-            "delay": (delay + 1.0) * self.sampling_interval,
-            "dead_zone": self._zone.copy(),
+            "gain": self.gain * estimate.gain,
+            "time_constant": interval * np.exp(estimate.log_constant),
+            "delay": interval * (estimate.delay + 1.0),
         }
 
     def reset(self) -> None:
         """Forget the episode and what was learnt: the next plant may be different."""
         super().reset()
-        self._loops = 0  # unknown before the first observation
+        self._k = 0
 
-    def _start(self, loops: int) -> None:
-        """Set all signals to rest, and the models to the results of the step test."""
-        zeros = partial(np.zeros, dtype=self._precision)
-        models, size = (loops, len(self._prior)), self._history + 1
-        self._loops, self._samples, self._now = loops, 0, size - 1
-        # Undelayed responses of unit gain, plain and prefiltered, (loops, time, responses); the
-        # flow within the limits, t/h, (loops, time).
-        shape = loops, size + _ROOM, len(self._poles)
-        self._units: Any = zeros(shape)
-        self._filtered: Any = zeros(shape)
-        self._flows: Any = zeros(shape[:2])
-        # The last outputs, newest first, prefiltered outputs, newest last, the outputs' offset
-        # and the predicted disturbance, degC.
-        self._outputs = np.zeros((loops, 3))
-        self._filtered_outputs = zeros((loops, self._every))
-        self._bias, self._disturbance = np.zeros(loops), np.zeros(loops)
-        # Sums over the past: squared regressors, regressors times outputs, squared outputs, and
-        # the number of samples.
-        self._information, self._products = zeros(models), zeros(models)
-        self._energy, self._seen = zeros((loops, 1)), zeros((loops, 1))
-        # The design: noise variance, model probabilities, and gains times probabilities.
-        self._variance = zeros((loops, 1)) + self._noise**2
-        self._weights, self._gains = zeros(models), zeros(models)
-        self._design(1.0)
+    def _prior(self, n: int) -> Prior:
+        """Return what is known of n plants from the step test."""
+        constants = (self._constant * TIME_CONSTANTS)[:, np.newaxis]
+        logarithms = self._log_probabilities[:, np.newaxis, np.newaxis]
+        return Prior(
+            time_constants=np.repeat(constants, n, axis=1),
+            shortest_delays=np.full(n, self._delays[0]),
+            log_probabilities=logarithms + np.zeros((len(TIME_CONSTANTS), n)),
+            gain_spread=np.full(n, GAIN_SPREAD),
+        )
 
-    def _learn(self) -> None:
-        """Add the last samples to the sums of the loops whose flow has moved."""
-        interval = self._every
-        flows = self._flows[:, self._now - self._history : self._now]
-        moved = flows.max(1) - flows.min(1) > EXCITED * (self.u_max - self.u_min) / 2.0
-        gate = moved.astype(self._precision)[:, np.newaxis]
-        for total in (self._information, self._products, self._energy, self._seen):
-            total *= 1.0 - gate * (1.0 - self.forgetting**interval)
-        outputs = self._filtered_outputs * gate
-        information, products = map(self._by_model, (self._information, self._products))
-        longest, shortest = int(self._delays[0]), int(self._delays[-1])
-        oldest = self._now - longest - interval + 1
-        filtered = self._filtered[:, oldest : self._now - shortest + 1]
-        squares = np.square(filtered)
-        squares *= gate[:, :, np.newaxis]
-        for i in range(interval):
-            delayed = slice(i, i + longest - shortest + 1, self._delay_step)
-            products += filtered[:, delayed] * outputs[:, i, np.newaxis, np.newaxis]
-            information += squares[:, delayed]
-        self._energy += np.square(outputs).sum(1, keepdims=True)
-        self._seen += interval * gate
+    def _start(self, n: int) -> None:
+        """Begin to control n plants at rest."""
+        edge = 0.0
+        if self.dead_zone > 0.0:
+            edge = self.dead_zone / abs(self._unit_flow) + CLEARANCE
+        edges = np.full(n, edge, np.float32)
+        low, high = sorted([self.u_min / self._unit_flow, self.u_max / self._unit_flow])
+        limits = np.full(n, low, np.float32), np.full(n, high, np.float32)
+        self._bank = Bank(self._prior(n))
+        self._observer = Observer(self._bank, edges, limits)
+        self._law = Law(self._bank, edges, limits)
 
-    def _design(self, share: float) -> None:
-        """Weight the models by the evidence, and adopt a share of the resulting design."""
-        # As few passes over all models as can be: they take most of the time.
-        prior = self._variance / (self._gain_spread * self.gain) ** 2
-        information = self._information + prior
-        products = self._products + prior * self.gain
-        gains = products / information
-        scores = products * gains  # what each model takes from the sum of squared outputs
-        left = self._energy + prior * self.gain**2 - scores.max(1, keepdims=True)
-        scores *= 0.5 * self._caution / self._variance
-        scores += self._prior
-        scores -= scores.max(1, keepdims=True)
-        weights = np.exp(np.maximum(scores, UNLIKELY, out=scores))
-        weights *= share / weights.sum(1, keepdims=True)
-        least = np.maximum(left, LEAST_NOISE**2 * self._seen)
-        self._variance = (least + NOISE_SAMPLES * self._noise**2) / (self._seen + NOISE_SAMPLES)
-
-        np.clip(gains, *sorted(self.gain * multiple for multiple in GAINS), out=gains)
-        weighted = weights * gains
-        squares = dot(weighted, gains) + dot(weights, self._variance / information)
-        # Variance over all gains, as a share of the square of their mean.
-        self._gain_variance = share * squares / np.square(weighted.sum(1)) - 1.0
-        for adopted, design in ((self._weights, weights), (self._gains, weighted)):
-            adopted *= 1.0 - share
-            adopted += design
-
-        # Averages over the models, for the control law.
-        self._trust = np.einsum("ij,j->i", self._weights, self._fading)
-        weights, gains = map(self._by_model, (self._weights, self._gains))
-        delays, responses = (np.ones(size, self._precision) for size in weights.shape[1:])
-        self._by_response, self._by_delay = delays @ weights, weights @ responses
-        self._sums = delays @ gains
-        rates = self._sums * (1.0 - self._poles)
-        rate = rates.sum(1)
-        self._shares = rates / rate[:, np.newaxis]
-        constant = self._sums.sum(1) / rate  # of the average plant, samples
-        self._feedback = -np.expm1(-1.0 / (self.closed_loop_time_constant * constant)) / rate
-        by_zone = self._by_response.reshape(self._loops, len(self._zones), -1).sum(2)
-        self._zone = self._zones[by_zone.argmax(1)]
-
-    def _control(self, rows: Array) -> Array:
-        if not self._loops:
+    def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self._k == 0:
             self._start(len(rows))
-        setpoint = rows[:, self.setpoint_index]
-        output = setpoint - rows[:, self.error_index]
-        filtered = self._filter(self._filtered_outputs[:, -1], output, self._outputs[:, 0])
-        self._outputs = np.column_stack([output, self._outputs[:, :-1]])
-        latest = [self._filtered_outputs[:, 1:], filtered.astype(self._precision)]
-        self._filtered_outputs = np.column_stack(latest)
-        self._samples += 1
-        if self._samples % self._every == 0:
-            self._learn()
-            self._design(self._share)
-
-        edge = np.where(self._zone > 0.0, self._zone + self._clearance, 0.0)
-        command: Array = avoid_dead_zone(self._law(setpoint), edge)
-        self._apply(command)
+        if self._k % self._every == 0:
+            setpoint = rows[:, self.setpoint_index] / self._authority
+            output = setpoint - rows[:, self.error_index] / self._authority
+            situation = self._observer.observe(
+                setpoint.astype(np.float32), output.astype(np.float32)
+            )
+            flow = self._law.flow(situation, self._corrections)
+            self._bank.apply(flow)
+            self._held = self._unit_flow * flow.astype(np.float64)
+        self._k += 1
+        command: NDArray[np.float64] = self._held
         return command
 
-    def _law(self, setpoint: Array) -> Array:
-        """Return the wanted command, t/h."""
-        output = self._outputs[:, 0]
-        models = (self._by_model(self._gains) * self._delayed(0)).reshape(self._loops, -1)
-        off = output - models.sum(1)
-        self._bias = self._bias + BIAS_RATE * (off - self._bias)
-        fading = self._trust * (output - self._bias) - models @ self._fading
-        self._disturbance += (1.0 - DISTURBANCE_POLE) * (fading - self._disturbance)
-        response = self._units[:, self._now]
-        foreseen = dot(self._sums, response) + self._bias + self._disturbance
-        command: Array = dot(self._shares, response)
-        command += self._feedback * (setpoint - foreseen)
-        return command
-
-    def _delayed(self, ago: int) -> Array:
-        """Return the models' outputs at gain 1 some samples ago, (loops, delays, responses)."""
-        first, last = self._now - self._delays[[0, -1]] - ago
-        delayed: Array = self._units[:, first : last + 1 : self._delay_step]
-        return delayed
-
-    def _apply(self, command: Array) -> None:
-        """Update the undelayed responses with a command."""
-        now, column = self._now, command[:, np.newaxis]
-        if now + 1 == self._units.shape[1]:
-            for history in (self._units, self._filtered, self._flows):
-                history[:, :-_ROOM] = history[:, _ROOM:].copy()
-            now -= _ROOM
-        before, self._now = self._units[:, now], now + 1
-        self._flows[:, now] = np.clip(command, self.u_min, self.u_max)
-        applied = applied_flow(column, self._dead_zones, self.u_min, self.u_max)
-        units = self._poles * before + (1.0 - self._poles) * applied
-        self._units[:, now + 1] = units
-        self._filtered[:, now + 1] = self._filter(self._filtered[:, now], units, before)
-
-    def _filter(self, filtered: Array, new: Array, before: Array) -> Array:
-        """Return the next sample of the prefilter."""
-        return PREFILTER_POLE * filtered + new - self._prefilter_zero * before
-
-    def _by_model(self, values: Array) -> Array:
-        """Return values of the models with shape (loops, delays, undelayed responses)."""
-        return values.reshape(self._loops, len(self._delays), -1)
+    def _corrections(self, inputs: Array) -> Array:
+        """Return the corrections of the law, shape (n, OUTPUTS): none, so it is linear."""
+        return np.zeros((len(inputs), OUTPUTS), np.float32)
 
 
-def dot(first: Array, second: Array) -> Array:
-    """Return the dot products of corresponding rows."""
-    products: Array = np.einsum("ij,ij->i", first, second)
-    return products
+def _check_range(limits: Any) -> tuple[float, float]:
+    """Return the limits of `delay_range` if they are valid; otherwise raise a ValueError."""
+    try:
+        shortest, longest = map(float, limits)
+    except (TypeError, ValueError):
+        shortest = longest = math.nan
+    if not 0.0 <= shortest <= longest < math.inf:
+        raise ValueError(
+            "delay_range must be two finite numbers of at least 0, the shortest delay first, "
+            f"got {limits!r}"
+        )
+    return shortest, longest
+
+
+@dataclass(eq=False, kw_only=True)
+class NeuralSelfTuningController(SelfTuningController):
+    """A self-tuning controller whose law is corrected by a trained recurrent network.
+
+    The network was trained once, on many plants, and does not learn online. It is run in
+    float32: a loop in a batch can differ from a single one by rounding. The parameters are
+    those of `SelfTuningController` and the following.
+
+    Parameters
+    ----------
+    network
+        The weights; by default those that come with the project.
+    """
+
+    network: RecurrentNetwork = field(default_factory=RecurrentNetwork.load, repr=False)
+
+    def _start(self, n: int) -> None:
+        super()._start(n)
+        self._state = self.network.initial_state(n)
+
+    def _corrections(self, inputs: Array) -> Array:
+        """Return the corrections that the network chooses, shape (n, OUTPUTS)."""
+        outputs, self._state = self.network.step(inputs, self._state)
+        return outputs
+
+
+@dataclass(eq=False, kw_only=True)
+class NeuralSmithPredictor(NeuralSelfTuningController):
+    """The same network and law with a single model, that of a step test.
+
+    The parameters are those of `NeuralSelfTuningController`; `delay_range` does not apply.
+    """
+
+    delay_range: None = field(init=False, default=None)
+
+    def _prior(self, n: int) -> Prior:
+        samples = self.delay / (self.sampling_interval * self._every)
+        return Prior(
+            time_constants=np.full((1, n), self._constant),
+            shortest_delays=np.full(n, max(math.floor(samples + 0.5) - 1, 0)),
+            log_probabilities=np.zeros((1, 1, n)),
+            gain_spread=np.full(n, EXACT),
+        )

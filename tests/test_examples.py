@@ -8,13 +8,32 @@ from functools import partial
 
 import gymnasium
 import matplotlib.pyplot as plt
+import torch
 from stable_baselines3 import PPO
 
 import mptc_gym.sb3
-from benchmarks.examples import through_plant
+from benchmarks.examples import recurrent, through_plant
 from mptc_gym import evaluate
 from mptc_gym.sb3 import load, spec_of
 from tests.conftest import ROOT
+
+
+def test_a_recurrent_policy_learns_and_enters_the_comparison(tmp_path, monkeypatch):
+    monkeypatch.setattr(recurrent, "FILE", tmp_path / "recurrent.pt")
+    monkeypatch.setattr(recurrent, "SEGMENT", 40)
+    network = recurrent.train(steps=2, plants=4)
+    torch.manual_seed(0)
+    untrained = recurrent.Recurrent()
+    trained = network.state_dict()
+    assert not torch.equal(trained["cell.weight_hh"], untrained.state_dict()["cell.weight_hh"])
+    torch.save(trained, recurrent.FILE)
+    # It remembers, and forgets at a reset.
+    policy, observations = recurrent.make(), torch.randn(3, 6).numpy()
+    first, second = policy.act(observations), policy.act(observations)
+    policy.reset()
+    assert (first != second).all()
+    assert (first == policy.act(observations)).all()
+    assert evaluate(policy, "MiddlePointHard-v0", episodes=2).mean_error > 0.0
 
 
 def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):

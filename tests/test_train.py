@@ -9,21 +9,30 @@ import pytest
 import torch
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from agents import LawNetwork, NeuralSmithPredictor, PolicyNetwork
+from agents import PolicyNetwork, RecurrentNetwork
 from agents.networks import PRETRAINED
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.examples import sb3
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.train import __main__ as program
-from benchmarks.train import loops, ppo, through_plant
-from benchmarks.train.loops import Draw, Loops, environment
-from benchmarks.train.through_plant import Net, Training, loss_of, train, validate
+from benchmarks.train import neural, ppo
+from benchmarks.train.neural import (
+    Loops,
+    Net,
+    Training,
+    chance_of_change,
+    expected_error,
+    mean_distance,
+)
+from benchmarks.train.plants import HOLDS, Sampler, environment
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
 from tests.conftest import ROOT
 
-SMALL = Training(steps=4, plants=4, samples=60, stretches=2, choosing=4, adding=3)
+SMALL = Training(
+    steps=2, second_steps=1, plants=4, segment=60, nodes=3, hidden=2, validation_episodes=2
+)
 RECIPE = replace(
     ppo.RECIPES["ppo"],
     plants=((8, {"setpoint": "random"}), (16, {"setpoint": "random", "noise_variance": 0.5})),
@@ -36,128 +45,84 @@ RECIPE = replace(
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setattr(through_plant, "VALIDATION_PLANTS", 4)
-    monkeypatch.setattr(through_plant, "VALIDATION_SAMPLES", 40)
     for name, value in {"n_steps": 32, "batch_size": 64}.items():
         monkeypatch.setitem(sb3.SETTINGS, name, value)
 
 
-def lively(training, seed=0):
-    """Return a network whose outputs matter."""
-    torch.manual_seed(seed)
-    net = Net(training)
-    with torch.no_grad():
-        for part in (net.choosing, net.adding):
-            part[-1].weight.mul_(10.0)
-    return net
-
-
-class TestLaw:
-    def test_what_is_trained_is_what_runs(self):
-        # The same plant, set point and network, in PyTorch with its gradient and in NumPy.
-        net, n, samples = lively(SMALL), 1, 150
-        numbers = Draw(n, samples, SMALL.spread, 3).plants()
-        for name in numbers:
-            if name.endswith(("_variance", "_amplitude")):
-                numbers[name] = torch.zeros(n)
-            if name.endswith("_drift"):
-                numbers[name] = torch.ones(n)
-        numbers["setpoint"] = torch.where(torch.arange(samples + 1) < 70, 3.0, -4.0)[:, None]
-        models = Draw(n, samples, SMALL.spread, 4).models(numbers, exact=True)
-        models["first"] = torch.tensor([True])
-        models["uncertainty"] = torch.tensor([0.1])
+class TestExpectedError:
+    def test_it_is_the_mean_of_what_happens(self):
+        # Of plants like those of `hard`, in which nothing was chosen by the draw.
+        batch = Sampler(400, 1.0, seed=1).batch()
+        net = Net(nodes=2, hidden=2)
         with torch.no_grad():
-            plants = environment(n, samples)
-            errors, _ = Loops(plants, numbers, models, 0).run(net, samples)
-        of = {name: values.item() for name, values in numbers.items() if values.ndim == 1}
-        pole = 1.0 - loops.RATE / of["time_constant_factor"]
-        alpha, scale, _ = loops.DYNAMICS.coefficients(
-            of["gain_factor"], of["time_constant_factor"]
-        )
-        a, b = [1.0, *(-x for x in alpha)], [scale * x for x in Parameters().b]
-        actuator = {name: of[name] for name in ("dead_zone", "u_min", "u_max")}
-        controller = NeuralSmithPredictor(
-            gain=sum(b) / sum(a), time_constant=-8.0 / np.log(pole), uncertainty=0.1,
-            delay=8.0 * (of["delay"] + 1.0), network=net.export(), **actuator,
-        )  # fmt: skip
-        plant = {"a": a, "b": b, "setpoint": [3.0] * 70 + [-4.0], **actuator}
-        plants = make_plants(1, samples + 1, **plant, delay=int(of["delay"]))
-        trajectory = rollout(plants, controller, samples + 1, seed=0)
-        error = (trajectory.setpoint - trajectory.output)[1:]
-        reach = abs(controller.u_max - controller.u_min) / 2.0 * abs(sum(b) / sum(a))
-        assert np.ptp(error) > 3.0
-        np.testing.assert_allclose(error, errors.numpy() * reach, atol=0.02)
+            outputs, factors = Loops(environment(400), batch, net, seed=1).run(400)
+            expected = expected_error(outputs, batch, factors, 1)
+        errors = (batch.setpoints[1:401] - outputs).abs()
+        reached = torch.arange(1, 401)[:, None] > batch.numbers["delay"]
+        assert expected.item() == pytest.approx(errors[reached].mean().item(), rel=0.03)
 
-    def test_plants_can_be_made_and_their_set_points_held(self):
-        draw = Draw(500, 60, SMALL.spread, 0)
-        numbers = draw.plants()
-        room = torch.minimum(-numbers["u_min"], numbers["u_max"])
-        reach = room * numbers["gain_factor"] * loops.GAIN
-        assert (numbers["setpoint"].abs().amax(0) <= reach).all()
-        assert (numbers["dead_zone"] < room).all()
-        assert 0.1 < (numbers["noise_variance"] == 0.0).float().mean() < 0.7
-        wrong, exact = (draw.models(numbers, exact=told)["gain_factor"] for told in (0, 1))
-        assert torch.equal(exact, numbers["gain_factor"])
-        assert 0.4 < (wrong != exact).float().mean() < 0.7
+    def test_changes_have_the_chance_that_the_environment_gives_them(self):
+        lengths = np.arange(HOLDS[0], HOLDS[1] + 1)
+        for age, samples in ((0, 19), (85, 19), (150, 25), (270, 19), (299, 13)):
+            left = lengths[lengths > age]
+            share = (left <= age + samples).mean()
+            chance = chance_of_change(torch.tensor([float(age)]), torch.tensor([samples]))
+            assert chance.item() == pytest.approx(share, abs=1e-6)
+
+    def test_the_distance_is_that_of_a_sample(self):
+        noise = torch.randn(200_000, generator=torch.Generator().manual_seed(0))
+        for distance, deviation in ((0.0, 1.0), (0.7, 0.5), (-2.0, 0.1)):
+            mean = mean_distance(torch.tensor(distance), torch.tensor(deviation))
+            sampled = (distance + deviation * noise).abs().mean()
+            assert mean.item() == pytest.approx(sampled.item(), rel=0.01)
 
 
-class TestGradient:
-    def test_it_is_that_of_differences(self):
-        net, samples = lively(SMALL).double(), 60
-        draw = Draw(3, samples, SMALL.spread, 0)
-        numbers = {name: value.double() for name, value in draw.plants().items()}
-        numbers |= {"dead_zone": torch.zeros(3, dtype=torch.double)}
-        models = draw.models(numbers, exact=True)
-        plants = environment(3, samples, dtype=torch.double)
+class TestSampler:
+    def test_an_exact_step_test_leaves_one_model(self):
+        batch = Sampler(200, 0.0, seed=2).batch()
+        prior, delays = batch.prior, batch.numbers["delay"].numpy()
+        exact = prior.gain_spread < 0.01
+        assert 0.3 < exact.mean() < 0.7
+        likely = prior.log_probabilities[:, :, exact] > -100.0
+        assert (likely.sum((0, 1)) == 1).all()
+        place = likely.any(1).argmax(0)
+        np.testing.assert_array_equal(prior.shortest_delays[exact] + place, delays[exact])
 
-        def loss():
-            errors, applied = Loops(plants, numbers, models, 0).run(net, samples)
-            return loss_of(errors, applied, numbers["small"], SMALL)
-
-        torch.set_default_dtype(torch.double)
-        try:
-            loss().backward()
-            weight = net.choosing[-1].weight
-            analytic = weight.grad.clone()
-            at = []
-            for step in (1e-4, -1e-4):
-                with torch.no_grad():
-                    weight[-1, 0] += step
-                    at.append(loss().item())
-                    weight[-1, 0] -= step
-        finally:
-            torch.set_default_dtype(torch.float)
-        assert analytic[-1, 0].item() == pytest.approx((at[0] - at[1]) / 2e-4, rel=0.05)
-
-    def test_training_reduces_the_error(self):
-        training = replace(SMALL, steps=4, samples=40, plants=8, choosing=16, adding=8)
-        torch.manual_seed(training.seed)
-        before = validate(Net(training), training)
-        after = train(training, training.seed).provenance["validation"]
-        assert after["all"] < before["all"]
+    def test_set_points_of_others_are_held_longer_than_any_of_hard(self):
+        batch = Sampler(100, 0.0, seed=3).batch()
+        changes = (batch.setpoints.diff(dim=0) != 0.0).nonzero()
+        for plant in range(100):
+            times = changes[changes[:, 1] == plant, 0]
+            assert (times.diff() > HOLDS[1]).all()
 
 
-def test_the_one_of_the_project_is_that_of_the_defaults():
-    network = LawNetwork.load(PRETRAINED / "nn-smith.npz")
-    kept = network.provenance
-    assert kept["training"] == json.loads(json.dumps(through_plant.asdict(Training())))
-    assert kept["cpu_seconds"] > 60.0
-    count = sum(W.size + len(b) for W, b in (*network.choosing, *network.adding))
-    of = Training()
-    samples = of.steps * of.plants * of.samples / 1e6
-    for name in ("neural-smith", "neural-self-tuning"):
-        assert f"{count:,} weights" in ROSTER[name].searched
-        assert f": {samples:.0f} M samples" in ROSTER[name].searched
+def test_a_seed_gives_a_network_that_differs_from_that_of_another():
+    first, again, other = (neural.train(SMALL, seed).weights for seed in (0, 0, 1))
+    for name, values in first.items():
+        np.testing.assert_array_equal(values, again[name])
+    assert not np.array_equal(first["output_biases"], other["output_biases"])
+
+
+def test_those_of_the_project_are_of_the_recipe():
+    members = ROSTER["neural-self-tuning"].members()
+    files = [member.provenance["file"] for member in members]
+    assert files == [f"neural-{seed}.npz" for seed in range(10_000, 10_005)]
+    recipe = json.loads(json.dumps(asdict(neural.RECIPES["neural"])))
+    for file in files:
+        network = RecurrentNetwork.load(PRETRAINED / file)
+        assert network.provenance["training"] == recipe
+        count = sum(values.size for values in network.weights.values())
+        assert f"{count:,} weights" in ROSTER["neural-smith"].searched
 
 
 @pytest.mark.parametrize(
     ("network", "steps", "files"),
-    [("nn-smith", 1, {"nn-smith"}), ("ppo", 8, {"ppo-10000", "ppo-10001"})],
+    [("neural", 2, {"neural-10000", "neural-10001"}), ("ppo", 8, {"ppo-10000", "ppo-10001"})],
 )
 def test_the_command_lists_trainings_by_their_seeds(
     network, steps, files, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setitem(through_plant.RECIPES, "nn-smith", SMALL)
+    monkeypatch.setitem(neural.RECIPES, "neural", SMALL)
     short = {"plants": ((64, {}),), "cases": {"short": {"max_episode_steps": 20}}}
     monkeypatch.setitem(ppo.RECIPES, "ppo", replace(ppo.RECIPES["ppo"], **short))
     arguments = [network, "--networks", "2", "--steps", str(steps), "--jobs", "1"]
@@ -166,9 +131,6 @@ def test_the_command_lists_trainings_by_their_seeds(
     assert {"10000", "10001"} <= set(shown.split())
     folder = tmp_path / network
     assert {file.stem for file in folder.glob("*.npz")} == files
-    if network == "nn-smith":
-        best = LawNetwork.load(folder / "nn-smith.npz").provenance["training"]["seed"]
-        assert f"Validation chooses seed {best}" in shown
 
 
 def weights(network):

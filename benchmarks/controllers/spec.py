@@ -21,6 +21,7 @@ LIMITS = "u_min", "u_max"
 DIRECTION = *LIMITS, "direction", "num_envs", "seed"
 STEP_TEST = *LIMITS, "gain", "time_constant", "delay", "sampling_interval"
 DATA_SHEET = *STEP_TEST, "dead_zone"
+BANK = *STEP_TEST, "widest_dead_zone", "delay_range"
 EVERYTHING = "parameters", "num_envs", "seed"
 
 
@@ -34,11 +35,25 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
     values["u_min"] = plant.range_of("u_min")[0]
     values["u_max"] = plant.range_of("u_max")[1]
     values["dead_zone"] = sum(plant.range_of("dead_zone")) / 2
+    values["widest_dead_zone"] = plant.range_of("dead_zone")[1]
+    values["delay_range"] = delay_range(plant)
     if "direction" in names:
         values["direction"] = plant_scale.direction(plant)
     if "gain" in names:
         values |= step_test(plant)
     return {name: values[name] for name in names}
+
+
+def delay_range(plant: Parameters) -> tuple[float, float] | None:
+    """Return the shortest and the longest delay that a plant may have, s; None if it is fixed.
+
+    They include the one sample that every input takes to show.
+    """
+    if not isinstance(plant.delay, Sequence):
+        return None
+    shortest, longest = plant.delay
+    interval = plant.sampling_interval
+    return (shortest + 1) * interval, (longest + 1) * interval
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,8 +15,8 @@ from benchmarks.lib.storage import replacing
 from benchmarks.loop.scenarios import PlantOptions
 
 SEED = SEEDS["networks"].first  # of the first network; the others follow
-# Modules with the recipes, and how many networks are trained by default.
-NETWORKS = {"nn-smith": ("through_plant", 1), "ppo": ("ppo", 5), "ppo-hard": ("ppo", 5)}
+# Modules with the recipes.
+NETWORKS = {"neural": "neural", "ppo": "ppo", "ppo-hard": "ppo"}
 
 
 @options
@@ -30,9 +30,8 @@ class Options:
 
     network: Annotated[str, Parameter(choices=NETWORKS)] = field(kw_only=False)
     """What to train."""
-    networks: Count | None = None
-    """Networks to train, each from its own seed (default: 1 for nn-smith, where validation
-    chooses the best; 5 for PPO, which are all compared)."""
+    networks: Count = 5
+    """Networks to train, each from its own seed. All are compared, none is chosen."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     steps: Count | None = None
     """Optimiser steps or, for PPO, samples of experience (default: as published)."""
@@ -43,11 +42,10 @@ class Options:
 def work(options: Options) -> str:
     """Train networks, save them and show their results in validation."""
     name = options.network
-    module_name, usual = NETWORKS[name]
-    module = importlib.import_module(f"benchmarks.train.{module_name}")
+    module = importlib.import_module(f"benchmarks.train.{NETWORKS[name]}")
     recipe = module.RECIPES[name]
     recipe = replace(recipe, steps=options.steps or recipe.steps)
-    seeds = range(SEED, SEED + (options.networks or usual))
+    seeds = range(SEED, SEED + options.networks)
     train, stem = module.train, name
     if options.plant.name:
         if name != "ppo":
@@ -61,7 +59,8 @@ def work(options: Options) -> str:
         kept = KeptResults(folder, save_network, module.load)
         trained = dict(options.fan_out.stream(tasks, "training", kept))
         networks = {seed: trained[f"seed {seed}"] for seed in seeds}
-        files = networks_to_keep(name, stem, networks)
+        show_validation(networks)
+        files = {f"{stem}-{seed}": network for seed, network in networks.items()}
         for file_name, network in files.items():
             save_network(folder / f"{file_name}.npz", network)
     return f"Written to {target}: {', '.join(files)}"
@@ -73,12 +72,8 @@ def save_network(path: Path, network: Any) -> None:
         network.save(partial_path)
 
 
-def networks_to_keep(name: str, stem: str, networks: Mapping[int, Any]) -> dict[str, Any]:
-    """Show the validation of networks, by seed, and return those to keep, by name of the file.
-
-    Of the networks for a bank of models, this is the best one; of PPO's policies, all. The
-    names of the files begin with `stem`.
-    """
+def show_validation(networks: Mapping[int, Any]) -> None:
+    """Print the validation of networks, by seed."""
     import pandas as pd
 
     from benchmarks.lib.report import on_screen
@@ -90,12 +85,6 @@ def networks_to_keep(name: str, stem: str, networks: Mapping[int, Any]) -> dict[
     }
     shown = pd.DataFrame.from_dict(rows, "index").map("{:.4g}".format)
     print(on_screen(shown.reset_index(names="seed")))
-    files = {f"{stem}-{seed}": network for seed, network in networks.items()}
-    if name == "nn-smith":
-        best = min(rows, key=lambda seed: rows[seed]["all"])
-        files = {name: networks[best]}
-        print(f"Validation chooses seed {best}")
-    return files
 
 
 main = command("train", Options, work)

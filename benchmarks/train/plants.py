@@ -1,0 +1,215 @@
+"""Sample plants to train on, with set points, noise and what a controller knows of them."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from agents.bank import Prior
+from agents.self_tuning import CLEARANCE, GAIN_SPREAD, TIME_CONSTANTS
+from mptc_gym import PRESETS, Parameters
+from mptc_gym.torch_env import MiddlePointTorchEnv
+
+SAMPLES: Final = 1200  # of an episode
+PAPER: Final = Parameters()
+GAIN: Final = abs(sum(PAPER.b) / sum(PAPER.a))  # degC per t/h
+POLE: Final = float(np.abs(np.roots(PAPER.a)).max())  # of the dominant time constant
+HALF_RANGE: Final = (PAPER.range_of("u_max")[1] - PAPER.range_of("u_min")[0]) / 2.0  # t/h
+HARD: Final = PRESETS["hard"]
+HOLDS: Final = (100, 300)  # samples, lengths of the levels of a random set point
+DELAYS: Final = 13  # in the bank of each plant
+# Ranges of the environment's arguments; every episode gets its own numbers within them.
+RANGES: Final[dict[str, Any]] = {
+    "delay": (6, 36),
+    "dead_zone": (0.0, 8.0),
+    "gain_factor": (0.5, 2.0),
+    "time_constant_factor": (0.4, 2.5),
+    "noise_variance": (0.0, 1.0),
+    "measurement_noise_variance": (0.0, 0.2),
+    "disturbance_amplitude": (0.0, 2.5),
+    "disturbance_interval": (100.0, 300.0),
+    "disturbance_walk_variance": (0.0, 0.001),
+    "gain_drift": (0.5, 2.0),
+    "time_constant_drift": (0.5, 2.0),
+}
+
+
+@dataclass(frozen=True)
+class Batch:
+    """An episode of n plants, and what the controllers know of them."""
+
+    numbers: dict[str, Tensor]
+    """Plant numbers by the environment's arguments, each of shape (n,)."""
+    setpoints: Tensor
+    """degC, shape (SAMPLES + 1, n), as the following two."""
+    ages: Tensor
+    """Samples since the set point changed."""
+    innovations: Tensor
+    """xi of (28), degC."""
+    changes_by_surprise: Tensor
+    """Whether a set point changes as in `hard`, at random, shape (n,)."""
+    amplitudes: Tensor
+    """Largest set point, degC, shape (n,)."""
+    prior: Prior
+    authorities: np.ndarray[Any, np.dtype[np.float32]]
+    """Steady effect of half the range of flows in the step test, degC, shape (n,)."""
+    edges: np.ndarray[Any, np.dtype[np.float32]]
+    """Widest edge of the dead zone, of half the range, shape (n,)."""
+
+    @property
+    def signals(self) -> dict[str, Tensor]:
+        """Signals and numbers for the environment's `reset`."""
+        noise = self.innovations.clone()
+        for lag, coefficient in enumerate(PAPER.c[1:], start=1):
+            noise[lag:] += coefficient * self.innovations[:-lag]
+        return {**self.numbers, "setpoint": self.setpoints, "noise": noise}
+
+
+def environment(n: int) -> MiddlePointTorchEnv:
+    """Return n differentiable plants that show the set point and the measured output."""
+    return MiddlePointTorchEnv(
+        n,
+        differentiable=True,
+        max_episode_steps=SAMPLES,
+        setpoint_window=1,
+        error_window=0,
+        output_window=1,
+        **RANGES,
+    )
+
+
+class Sampler:
+    """Random batches of n plants, a share of which is like those of `hard`.
+
+    Of the others, one half is known by an exact step test and drifts in part, and one half has
+    a step test that is wrong. Their set points are held for longer than the longest hold of
+    `hard`, and mostly alternate.
+    """
+
+    def __init__(self, n: int, hard_share: float, seed: int) -> None:
+        self._n = n
+        self._hard_share = hard_share
+        self._generator = torch.Generator()
+        self._generator.manual_seed(seed)
+
+    def batch(self) -> Batch:
+        """Return new plants."""
+        kind = self._uniform(0.0, 1.0)
+        hard = kind < self._hard_share
+        exact = kind > (1.0 + self._hard_share) / 2.0
+        numbers = self._numbers(hard)
+        reach = 0.95 * GAIN * HALF_RANGE * numbers["gain_factor"]
+        amplitudes = torch.where(self._some(0.5), 5.0, self._uniform(1.0, 6.0))
+        amplitudes = torch.where(hard, PAPER.setpoint_amplitude, amplitudes.minimum(reach))
+        setpoints, ages = self._setpoints(amplitudes, hard)
+        innovations = torch.randn(SAMPLES + 1, self._n, generator=self._generator)
+        innovations *= numbers["noise_variance"].sqrt()
+        innovations[0] = 0.0  # the plant begins at rest
+        prior, gains = self._knowledge(numbers, hard, exact)
+        widest = numbers["dead_zone"] + self._uniform(0.0, 3.0) * ~exact
+        widest = torch.where(hard, HARD["dead_zone"][1], widest.clamp(max=8.0))
+        return Batch(
+            numbers=numbers,
+            setpoints=setpoints,
+            ages=ages,
+            innovations=innovations,
+            changes_by_surprise=hard,
+            amplitudes=amplitudes,
+            prior=prior,
+            authorities=(gains * GAIN * HALF_RANGE).numpy(),
+            edges=(widest / HALF_RANGE + CLEARANCE).numpy(),
+        )
+
+    def _uniform(self, low: Any, high: Any, *shape: int) -> Tensor:
+        """Return uniform numbers, with shape (n,) by default."""
+        uniform = torch.rand(*(shape or (self._n,)), generator=self._generator)
+        values: Tensor = low + uniform * (high - low)
+        return values
+
+    def _normal(self) -> Tensor:
+        """Return normal numbers within two standard deviations, shape (n,)."""
+        return torch.randn(self._n, generator=self._generator).clamp(-2.0, 2.0)
+
+    def _some(self, share: float) -> Tensor:
+        """Return True for a share of the plants."""
+        return self._uniform(0.0, 1.0) < share
+
+    def _numbers(self, hard: Tensor) -> dict[str, Tensor]:
+        """Return the plants' numbers, of `hard` and wider ones."""
+        noisy, loaded, drifts = self._some(0.65), self._some(0.5), self._some(0.4)
+        octave = math.log(2.0)
+        others = {
+            "delay": self._uniform(6.0, 37.0).floor(),
+            "dead_zone": self._uniform(0.0, 8.0),
+            "gain_factor": self._uniform(0.75, 1.6),
+            "time_constant_factor": self._uniform(-octave, octave).exp(),
+            "noise_variance": self._uniform(0.0, 1.0) * noisy,
+            "measurement_noise_variance": self._uniform(0.0, 0.2) * noisy * self._some(0.5),
+            "disturbance_amplitude": self._uniform(0.5, 2.5) * loaded,
+            "disturbance_interval": self._uniform(100.0, 300.0),
+            "disturbance_walk_variance": self._uniform(0.0, 0.001) * loaded * noisy,
+            "gain_drift": torch.where(drifts, self._uniform(0.6, 1.6), 1.0),
+            "time_constant_drift": torch.where(drifts, self._uniform(0.75, 1.35), 1.0),
+        }
+        numbers = {}
+        for name, values in others.items():
+            low, high = np.broadcast_to(HARD[name], 2).tolist()
+            if name == "delay":
+                like_hard = self._uniform(low, high + 1).floor()
+            else:
+                like_hard = self._uniform(low, high)
+            numbers[name] = torch.where(hard, like_hard, values)
+        return numbers
+
+    def _setpoints(self, amplitudes: Tensor, hard: Tensor) -> tuple[Tensor, Tensor]:
+        """Return set points, degC, and their ages, samples, each of shape (SAMPLES + 1, n)."""
+        n, (shortest, longest) = self._n, HOLDS
+        low = torch.where(hard, float(shortest), self._uniform(longest + 10.0, 700.0))
+        high = torch.where(hard, float(longest), low + longest)
+        count = SAMPLES // shortest + 2
+        lengths = (low + self._uniform(0.0, 1.0, count, n) * (high + 1.0 - low)).floor()
+        starts = torch.cat([torch.zeros(1, n), lengths.cumsum(0)[:-1]])
+        levels = self._uniform(-1.0, 1.0, count, n)
+        signs = torch.where(torch.arange(count)[:, None] % 2 == 0, 1.0, -1.0)
+        alternates = ~hard & self._some(0.8)
+        levels = amplitudes * torch.where(alternates, signs * levels[0].sign(), levels)
+        samples = torch.arange(SAMPLES + 1.0)
+        times = samples.expand(n, -1).contiguous()
+        places = torch.searchsorted(starts.T.contiguous(), times, right=True)
+        number = places.T - 1  # of the level at each sample
+        return levels.gather(0, number), samples[:, None] - starts.gather(0, number)
+
+    def _knowledge(
+        self, numbers: dict[str, Tensor], hard: Tensor, exact: Tensor
+    ) -> tuple[Prior, Tensor]:
+        """Return the prior, and the step tests' gains as multiples of the paper's.
+
+        Every bank has the same shape. Where the step test is exact, one of its models is
+        certain.
+        """
+        middle = sum(HARD["gain_factor"]) / 2.0  # of gain and time constant in `hard`
+        wrong = {"gain_factor": GAIN_SPREAD, "time_constant_factor": 0.35}
+        known = {}
+        for name, spread in wrong.items():
+            off = torch.where(exact, 0.0, spread * self._normal())
+            known[name] = torch.where(hard, middle, numbers[name] * off.exp())
+        constants = -1.0 / torch.log(1.0 - (1.0 - POLE) / known["time_constant_factor"])
+        place = self._uniform(0.0, DELAYS).floor()  # of the plant's delay in the bank
+        shortest = (numbers["delay"] - place).clamp(min=1.0)
+        shortest = torch.where(hard, HARD["delay"][0], shortest)
+        off = torch.arange(float(DELAYS))[:, None] - (numbers["delay"] - shortest)
+        graded = ~hard & self._some(0.5)
+        of_delay = -0.5 * (off / 4.0).square() * graded
+        is_middle = torch.from_numpy(TIME_CONSTANTS == 1.0)
+        excluded = exact & ~((off[:, None] == 0.0) & is_middle[:, None])
+        logarithms = of_delay[:, None] + torch.where(excluded, -200.0, 0.0)
+        prior = Prior(
+            time_constants=(torch.from_numpy(TIME_CONSTANTS)[:, None] * constants).numpy(),
+            shortest_delays=shortest.numpy(),
+            log_probabilities=logarithms.numpy(),
+            gain_spread=torch.where(exact, 1e-3, GAIN_SPREAD).numpy(),
+        )
+        return prior, known["gain_factor"]
