@@ -30,7 +30,12 @@ RESIDUAL_PREFERENCE: Final = np.array([-1.0, 1.0, 0.0], np.float32)
 APPROACH: Final = -0.7  # logit of the share of the way to the target that a sample should cover
 OUTLIER: Final = 12.0  # multiples of the noise, beyond which a network sees no difference
 DOUBT: Final = 0.002  # of the authority, added to the noise that signals are divided by
-CALM: Final = 0.03  # of the authority, noise below which nothing is gained by a hedge
+HEDGED: Final = 0.03  # of the authority, noise above which a hedge gains something
+# Where there is less noise than this, of the authority, nothing is to be filtered: the newest
+# samples tell most, and the law is linear, with these additions to the preferences.
+CALM: Final = 0.04
+CALM_LOAD: Final = np.array([6.0, 0.0, -3.0, -3.0], np.float32)
+CALM_RESIDUAL: Final = np.array([2.0, -2.0, -2.0], np.float32)
 LONGEST_HOLD: Final = 300.0  # samples, age of a set point beyond which it is not counted
 TYPICAL_DELAY: Final = 18.0  # samples, that of (28)
 TYPICAL_LOG_CONSTANT: Final = 3.0  # natural logarithm of its time constant in samples
@@ -212,6 +217,7 @@ class Law:
         self._coefficients = tuple(map(convert, second_order(bank.time_constants)))
         self._load_preference = convert(LOAD_PREFERENCE)
         self._residual_preference = convert(RESIDUAL_PREFERENCE)
+        self._calm_load, self._calm_residual = convert(CALM_LOAD), convert(CALM_RESIDUAL)
         # The undelayed responses of the models, their last ones, and the last flow.
         self._response = convert(np.zeros_like(bank.time_constants))
         self._before = self._response
@@ -229,12 +235,15 @@ class Law:
         signals = [model, 10.0 * slope, gap, self._flow, gap / (abs(gap) + 2.0 * noise)]
         past = convert(situation.inputs)
         inputs = xp.concatenate([past, xp.stack(signals, axis=1)], axis=1)
-        corrections = Corrections.of(network(inputs))
+        calm = (1.0 / (1.0 + (noise / CALM) ** 6))[:, None]
+        corrections = Corrections.of((1.0 - calm) * network(inputs))
 
-        load = self._mean(loads, corrections.load + self._load_preference)
-        residual = self._mean(residuals, corrections.residual + self._residual_preference)
+        load_logits = corrections.load + self._load_preference + calm * self._calm_load
+        load = self._mean(loads, load_logits)
+        residual_logits = corrections.residual + self._residual_preference
+        residual = self._mean(residuals, residual_logits + calm * self._calm_residual)
         forecast = fading * residual + (1.0 - fading) * load + noise * corrections.forecast
-        hedge = corrections.hedge * noise**2 / (noise**2 + CALM**2)
+        hedge = corrections.hedge * noise**2 / (noise**2 + HEDGED**2)
         target = setpoint * (1.0 - hedge) - forecast
         share = 1.0 / (1.0 + self._exp(-corrections.share - APPROACH))
         wanted = (target + share / convert(estimate.rate) * (target - model)) / gain

@@ -124,7 +124,7 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     """
     path = _zip_path(path)
     if not path.is_file():
-        reject("path", str(path), "an existing file")
+        raise ValueError(f"path must be an existing file, got {path}")
     try:
         with zipfile.ZipFile(path) as archive:
             record = json.loads(archive.read(MEMBER))

@@ -41,7 +41,7 @@ def test_it_is_told_the_plant_that_it_is_made_for(entry, member):
     assert entry.knows
     assert entry.searched
     plant = ACTUATOR if "direction" in entry.assumes else OTHER
-    found = run_case(Scenario("other", "", 600, plant), member, 2).runs["mae"].to_numpy()
+    found = run_case(Scenario("other", "", 600, plant), member, 2, SEED).runs["mae"].to_numpy()
     if entry.name == "idle":
         np.testing.assert_allclose(found, IDLE)
         return
@@ -225,7 +225,7 @@ class TestSavedPolicies:
     @pytest.mark.parametrize(
         ("location", "complaint"),
         [
-            ("PPO:{}/wide.zip", "env must have the observation space of policy's training"),
+            ("PPO:{}/wide.zip", "env must have the space of the observations of policy's training"),
             ("No:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("SAC:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("PPO:{}/nan.zip", "Expected parameter loc"),

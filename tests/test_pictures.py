@@ -23,7 +23,7 @@ def ticks(axis):
 
 class TestFindings:
     def test_of_scores(self):
-        scores = {"mpc": 0.998, "nn-smith": 0.9971, "mine": 0.9, "pi": -0.0001}
+        scores = {"mpc": 0.998, "neural-smith": 0.9971, "mine": 0.9, "pi": -0.0001}
         estimates = {agent: Estimate(x, x, x, 1) for agent, x in scores.items()}
         assert plots.scores_finding(estimates) == (
             "MPC scores highest with 0.998, neural Smith follows with 0.997; "
@@ -65,7 +65,7 @@ class TestFindings:
 
 
 def test_a_ratio_below_the_axis_is_said_at_its_tick():
-    for ratios, lowest in (([1.5, 1.002], "1.001"), ([1.5, 0.98], "≤ 1.001")):
+    for ratios, lowest in (([1.5, 1.002], "1.001"), ([1.5, 0.98], "< 1.001")):
         axes = Figure().subplots()
         scale_by_ratio(axes, "y", ratios)
         assert ticks(axes.yaxis)[:3] == [lowest, "1.003", "1.01"]
@@ -101,7 +101,7 @@ def test_scores_beyond_the_axis_stand_at_its_ends(figures, tmp_path):
     plots.plot_scores(scores, pd.DataFrame(rows), tmp_path / "scores.png")
     (axes,) = figures[0].axes
     labels = ticks(axes.xaxis)
-    assert (labels[0], labels[-1]) == ("≤ -0.5", "≥ 0.999")
+    assert (labels[0], labels[-1]) == ("< -0.5", "> 0.999")
     shown = np.concatenate([line.get_xdata() for line in axes.get_lines()])
     right, left = sorted(axes.get_xlim())
     assert ((right < shown) & (shown < left)).all()

@@ -38,7 +38,7 @@ def test_every_command_stays_in_its_block():
         "studies": [sweep.SEED, Batch(1000).seed + 1000 - 1, watch.Options().seed],
         "networks": [train.SEED, train.SEED + 5 - 1],
         "sampler": [tune.SEED, tune.SEED + 800 - 1],
-        "preparation": [*trials, trials[-1] + 100 - 1, roster.COMMISSIONING_SEED + 1000 - 1],
+        "preparation": [*trials, trials[-1] + 100 - 1, spec.COMMISSIONING_SEED + 1000 - 1],
         "finals": [*finals, finals[-1] + tune.FINAL_RUNS - 1],
         "validation": [evaluation.VALIDATION_SEED],
         "published": [evaluation.SEED, evaluation.SEED + 1000 - 1],

@@ -115,9 +115,9 @@ def _scale_by_score(axes: Axes, shown: Sequence[float]) -> None:
     """Make the x axis, of `distance(scores)`, logarithmic, with scores as its ticks."""
     labels = [f"{score:g}" for score in SCORE_TICKS]
     if min(shown) < LOWEST_SCORE:
-        labels[0] = f"≤ {labels[0]}"
+        labels[0] = f"< {labels[0]}"
     if max(shown) > HIGHEST_SCORE:
-        labels[-1] = f"≥ {labels[-1]}"
+        labels[-1] = f"> {labels[-1]}"
     start = 1.15 * float(distance(min(0.0, *shown)))
     end = float(distance(HIGHEST_SCORE)) / 1.3
     axes.set_xscale("log")

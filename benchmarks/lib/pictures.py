@@ -167,7 +167,7 @@ def scale_by_ratio(axes: Axes, direction: Literal["x", "y"], ratios: ArrayLike) 
     values = excess(ratios)
     labels = [f"{ratio:g}" for ratio in RATIO_TICKS]
     if np.min(ratios) < RATIO_FLOOR:
-        labels[0] = f"≤ {labels[0]}"
+        labels[0] = f"< {labels[0]}"
     limits = (values.min() / 1.4, values.max() * 1.4)
     axes.set(**{f"{direction}scale": "log", f"{direction}lim": limits})
     axis = getattr(axes, f"{direction}axis")
