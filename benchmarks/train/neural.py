@@ -34,7 +34,7 @@ from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 load = RecurrentNetwork.load
-CYCLE_SEEDS = 1_000_000  # between the seeds of a cycle and those of the next one
+CYCLE_OFFSET = 1_000_000  # between the seeds of a cycle and those of the next one
 LEAST_NOISE = 0.05  # degC; below it the expected error is rounded at 0, where |e| has a kink
 
 
@@ -237,7 +237,7 @@ def run_cycle(
     """Train for a cycle of the learning rate, and return the running mean of the weights."""
     mean = copy.deepcopy(net)
     optimiser = torch.optim.Adam(net.parameters())
-    first_seed = seed + CYCLE_SEEDS * cycle
+    first_seed = seed + CYCLE_OFFSET * cycle
     sampler = Sampler(training.plants, training.hard_share, first_seed)
     plants = environment(training.plants)
     segments = SAMPLES // training.segment
