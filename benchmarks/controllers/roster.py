@@ -180,7 +180,7 @@ def trained(kind: type[PolicyNetwork | RecurrentNetwork], files: str) -> Mapping
 _STEP_TEST = "gain, time constant, delay"
 _DATA_SHEET = f"{_STEP_TEST}, dead zone, limits"
 _NN = "25 weights in the run itself; 6 gains by 800 trials: 566 M samples, 6 min"
-_LAW = "13,420 weights for all plants: 11.5 M samples a network, 8 min; 30 settings by hand"
+_LAW = "16,496 weights for all plants: 9.4 M samples a network, 8 min; 45 settings by hand"
 _RULE = "nothing: one step test, a rule"
 _NETWORK = partial(trained, RecurrentNetwork, "neural-[0-9]*.npz")
 
