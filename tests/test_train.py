@@ -256,7 +256,7 @@ class TestOtherPlants:
         monkeypatch.setitem(ppo.RECIPES, "ppo", short)
         given = "ppo --networks 2 --steps 8 --jobs 1 --set b=[0.0456,0.00404] --set u_max=12"
         assert program.main([*given.split(), "--out", str(tmp_path)]) == 0
-        files = sorted(tmp_path.glob("ppo-plant-*.npz"))
+        files = sorted(tmp_path.glob("ppo-plant/*.npz"))
         assert len(files) == 2
         (spec,) = chosen([], [f"mine={file}" for file in files]).values()
         assert [each.provenance["file"] for each in spec.members()] == [*map(str, files)]
