@@ -104,16 +104,21 @@ def work(options: Options) -> str:
     members = {name: each.members() for name, each in made_by.items()}
     nominal = options.plant.arguments()
     plants = design(options, nominal)
+    ranges = ranges_of(plants)
     made = origin()
     tasks: dict[str, Any] = {}
     for i, plant in enumerate(plants):
         case = {**nominal, **plant, **SETPOINT}
         tasks[f"plant {i}"] = partial(scale_of, case, options.runs)
-        told = case if options.told == "each" else {**nominal, **SETPOINT}
-        for name, of in members.items():
+        for name, controllers in members.items():
             # The plants take the members in turn, so that the maps show how much they differ.
-            member = of[i % len(of)]
-            tasks[f"plant {i}, {name}"] = partial(run_agent, member, told, case, options.runs)
+            member = controllers[i % len(controllers)]
+            prior = {**nominal, **SETPOINT}
+            if "delay_range" in member.prior_knowledge:
+                prior |= ranges
+            if options.told == "each":
+                prior = case
+            tasks[f"plant {i}, {name}"] = partial(run_agent, member, prior, case, options.runs)
     target = options.out or Path(f"results/sweep-{options.design}")
     # The conditions do not cover the code of a user's own controller.
     conditions = None if options.controllers.agent else conditions_of("sweep", options)
@@ -149,6 +154,16 @@ def design(options: Options, nominal: Arguments) -> list[Arguments]:
         for plant in plants:
             Parameters(**{**nominal, **plant})
     return plants
+
+
+def ranges_of(plants: Sequence[Arguments]) -> Arguments:
+    """Return the ranges of delay and dead zone in a design, where they vary."""
+    ranges: Arguments = {}
+    for name in ("delay", "dead_zone"):
+        values = [plant[name] for plant in plants if name in plant]
+        if len(set(values)) > 1:
+            ranges[name] = [min(values), max(values)]
+    return ranges
 
 
 def run_agent(
