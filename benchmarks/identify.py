@@ -399,7 +399,7 @@ def report(plant: Identified, options: Options, arguments: dict[str, Any]) -> li
     )
     table = pd.DataFrame(rows, columns=["", "value", "95 %", "unit"])
     shown = "The log as it was recorded, and as the model simulates it from the flow"
-    return [Section("", text, table, {"identify.png": shown})]
+    return [Section("", text, table, pictures={"identify.png": shown})]
 
 
 def draw(plant: Identified, options: Options, title: str, path: Path) -> None:

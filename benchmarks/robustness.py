@@ -65,7 +65,7 @@ def work(options: Options) -> str:
     at_one = table[table["Ms"] == ROBUSTNESS]
     picture = {"robustness.png": "Error over valve travel along the robustness of three rules"}
     title = f"Three rules at an Ms of {ROBUSTNESS:g}"
-    sections = [Section(title, [TEXT], overview(at_one), picture)]
+    sections = [Section(title, [TEXT], overview(at_one), pictures=picture)]
     with results_folder(options.out) as folder:
         write_csv(folder / "robustness.csv", table)
         draw(table, folder / "robustness.png")

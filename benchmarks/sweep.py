@@ -250,7 +250,8 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) 
     overview.insert(0, "controller", overview.pop("agent").map(label))
     for name, (heading, form) in COLUMNS.items():
         overview[heading] = overview.pop(name).map(form.format)
-    sections = [Section("Errors on other plants", [TEXT], overview, {"map.png": PICTURE})]
+    pictures = {"map.png": PICTURE}
+    sections = [Section("Errors on other plants", [TEXT], overview, pictures=pictures)]
     for title, pairs in QUESTIONS.items():
         asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
         if asked and "gain_drift" in runs and len(compared := differences(runs, asked)):

@@ -389,6 +389,8 @@ class TestCompare:
         assert name in {cell.text for cell in page.iter("td")}
         assert set(pd.read_csv(out / "runs.csv")["agent"]) == {name}
         assert (out / "scores.png").exists()
+        page = (out / "report.md").read_text()
+        assert all(f"({picture.name})" in page for picture in out.glob("*.png"))
 
     @pytest.mark.usefixtures("undrawn")
     def test_where_limits_are_drawn_shares_are_not_measured(self, monkeypatch, tmp_path):

@@ -320,7 +320,7 @@ def report(
             "Score: 0 for an idle valve, 1 for the least possible error",
             [SCORE, *sorted(notes), *not_ranked],
             score_table(runs, estimates, scores, misfits),
-            {
+            pictures={
                 "scores.png": "The score of each controller, and a small tick for each case",
                 "travel.png": "Mean error and mean valve travel of each controller; the lower "
                 "left is better",

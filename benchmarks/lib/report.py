@@ -8,7 +8,7 @@ import re
 import shutil
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ class Section:
     title: str  # "" for none
     text: Sequence[str] = ()  # paragraphs
     table: pd.DataFrame | None = None  # of text
+    _: KW_ONLY
     bold: Collection[str] = ()  # cells that are shown in bold type
     # PNG files in the report's folder, and for each what it shows, in a sentence.
     pictures: Mapping[str, str] = field(default_factory=dict)
