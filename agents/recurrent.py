@@ -74,7 +74,7 @@ class RecurrentNetwork:
         return np.zeros((n, self.state_weights.shape[1]), np.float32)
 
     def step(self, inputs: Array, state: Array) -> tuple[Array, Array]:
-        """Return outputs, shape (n, OUTPUTS), and the next state for those of n loops."""
+        """Return the outputs, shape (n, OUTPUTS), and the next state of n loops."""
         from_inputs = inputs @ self.input_weights.T + self.input_biases
         from_state = state @ self.state_weights.T + self.state_biases
         reset_in, update_in, candidate_in = np.split(from_inputs, 3, axis=1)

@@ -173,7 +173,7 @@ def refuse_the_models_own(copy: Copy, policy: Any) -> None:
     for layer in copy.shared:
         if have_a_layer_in_common(layer, training):
             raise ValueError(
-                "env must not be the environments of policy's training where these cannot be "
+                "env must not be the training environments of policy, as these cannot be "
                 f"copied ({copy.reason}): make others like them, or use "
                 "evaluate(model, spec_of(model, id)), with spec_of from mptc_gym.sb3"
             )

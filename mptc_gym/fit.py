@@ -47,8 +47,8 @@ def check_fit(policy: Any, plants: Plants) -> None:
     if is_environment(training) and plant_groups(training):  # they are not when closed
         _compare_windows(plant_groups(training), plants.groups)
         _compare_wrappers(wrapper_chains(training), chains)
-    _compare_spaces("observations", target.observation_space, plants.observation_space)
-    _compare_spaces("actions", target.action_space, plants.action_space)
+    _compare_spaces("observation", target.observation_space, plants.observation_space)
+    _compare_spaces("action", target.action_space, plants.action_space)
 
 
 def _compare_windows(of_training: list[PlantGroup], of_env: list[PlantGroup]) -> None:
@@ -85,7 +85,7 @@ def _compare_spaces(kind: str, of_training: Space[Any], of_env: Space[Any]) -> N
     """Refuse another space than that of the training."""
     if of_training != of_env:
         raise ValueError(
-            f"env must have the space of the {kind} of policy's training, "
+            f"env must have the same {kind} space as in the training of policy, "
             f"{_shape(of_training)}, got {_shape(of_env)}: {_REMEDY}"
         )
 

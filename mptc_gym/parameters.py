@@ -269,7 +269,7 @@ class Parameters(PlantNumbers[Number]):
         return self._can_differ(0.0, *_LOAD_ARGUMENTS)
 
     def _can_differ(self, value: float, *names: str) -> bool:
-        """Return whether one of these plant numbers is, or can be drawn, other than `value`."""
+        """Return whether any of these plant numbers differs from `value`, or may."""
         return any(self.range_of(name) != (value, value) for name in names)
 
     @property

@@ -225,7 +225,7 @@ class TestSavedPolicies:
     @pytest.mark.parametrize(
         ("location", "complaint"),
         [
-            ("PPO:{}/wide.zip", "env must have the space of the observations of policy's"),
+            ("PPO:{}/wide.zip", "env must have the same observation space as in the training"),
             ("No:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("SAC:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("PPO:{}/nan.zip", "Expected parameter loc"),

@@ -534,7 +534,7 @@ REFUSED = {
         r"windows of .* \(3, 3, 0, 3\), got .*model\.get_env\(\)\), or spec_of\(model"),
     "the same, without environments": (
         lambda: (model_of(PPO, made(action_window=3)).policy, NOISY),
-        r"observations of policy's training, shape \(9,\) within .* got shape \(6,\)"),
+        r"space as in the training of policy, shape \(9,\) within .* got shape \(6,\)"),
     "model of windows with these bounds": (
         lambda: (model_of(PPO, made(error_window=0, output_window=3)),
                  made(setpoint_window=6, error_window=0)), "windows of policy's training"),
@@ -568,10 +568,10 @@ REFUSED = {
         "wrappers of policy's training, TransformObservation, got none"),
     "processes of its training": (
         lambda: ((m := model_of(PPO, processes())), m.get_env()),
-        r"training where these cannot be copied \(SubprocVecEnv runs in .*spec_of\(model, id"),
+        r"as these cannot be copied \(SubprocVecEnv runs in .*spec_of\(model, id"),
     "window of its training": (
         lambda: ((m := model_of(PPO, made(render_mode="human"))), m.get_env()),
-        r"training where these cannot be copied \(MiddlePointEnv shows a window"),
+        r"as these cannot be copied \(MiddlePointEnv shows a window"),
 }  # fmt: skip
 
 

@@ -108,7 +108,7 @@ class Panels:
     def add_legend(self, entries: Mapping[str, Artist], columns: int) -> None:
         """Put a legend in the unused places of the last row, or else below all panels.
 
-        `entries` holds an artist for each text; `columns` is the number of columns below.
+        `entries` holds an artist for each text. A legend below has `columns` columns.
         """
         handles = list(entries.values())
         texts = list(entries)

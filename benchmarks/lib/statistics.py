@@ -22,7 +22,7 @@ class Estimate:
     runs: int
 
     def scaled(self, factor: float) -> "Estimate":
-        """Return the estimate of a positive multiple."""
+        """Return this estimate, and both ends of its interval, times a positive factor."""
         return Estimate(factor * self.value, factor * self.low, factor * self.high, self.runs)
 
     def __format__(self, form: str) -> str:
