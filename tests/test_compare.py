@@ -158,7 +158,9 @@ class TestReport:
         (tmp_path / "picture.png").write_bytes(b"\x89PNG")
         table = pd.DataFrame({"name": ["a < b", "c"], "value": ["1.0 (0.9 to 1.1)", "[1, 2]"]})
         pictures = {"picture.png": "What it shows"}
-        first = Section("First", ["Some text."], table, ["a < b"], pictures)
+        first = Section(
+            "First", ["Some text."], table, bold=["a < b"], pictures=pictures
+        )
         write_report(tmp_path, "Title", [first, Section("Second")], MADE)
         page = (tmp_path / "report.md").read_text()
         assert page.startswith("# Title\n\n## First\n\nSome text.\n\n| name")
@@ -178,7 +180,7 @@ class TestReport:
     def test_texts_from_outside_are_shown_as_they_are(self, tmp_path):
         (tmp_path / "picture.png").touch()
         table = pd.DataFrame({HOSTILE: [HOSTILE, "x"], "value": ["1", HOSTILE]})
-        sections = [Section(HOSTILE, [HOSTILE], table, [], {"picture.png": HOSTILE})]
+        sections = [Section(HOSTILE, [HOSTILE], table, pictures={"picture.png": HOSTILE})]
         origin = {**MADE, "command": HOSTILE, "missing": HOSTILE}
         write_report(tmp_path, HOSTILE, sections, origin)
         page = ElementTree.fromstring(body_of(tmp_path / "report.html"))
@@ -301,7 +303,7 @@ class TestCompare:
 
     @pytest.mark.usefixtures("undrawn")
     def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):
-        out = compared("--presets --runs 2 --scenarios randomised --agents nn neural-smith")
+        out = compared("--presets --runs 2 --scenarios randomised --agents nn self-tuning")
         runs = pd.read_csv(out / "runs.csv").set_index("agent")
         estimates = pd.read_csv(out / "estimates.csv").set_index("agent")
         for agent in estimates.index:
