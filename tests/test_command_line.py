@@ -165,7 +165,7 @@ def test_the_map_shows_the_questions_runs_a_command_or_names_the_one_meant(refus
     ids=lambda page: str(page.relative_to(ROOT)),
 )
 def test_a_command_on_a_page_can_be_typed_as_it_stands(page):
-    text = page.read_text("utf-8").replace("\\\n", "")
+    text = page.read_text("utf-8").replace("\\\n", "").replace("\\`", "`")
     for name, options in re.findall(r"python -m benchmarks\.([\w.]+)([^`|#\n]*)", text):
         if name in COMMANDS:  # an example takes no options
             declared = importlib.import_module(COMMANDS[name]).Options

@@ -158,9 +158,7 @@ class TestReport:
         (tmp_path / "picture.png").write_bytes(b"\x89PNG")
         table = pd.DataFrame({"name": ["a < b", "c"], "value": ["1.0 (0.9 to 1.1)", "[1, 2]"]})
         pictures = {"picture.png": "What it shows"}
-        first = Section(
-            "First", ["Some text."], table, bold=["a < b"], pictures=pictures
-        )
+        first = Section("First", ["Some text."], table, bold=["a < b"], pictures=pictures)
         write_report(tmp_path, "Title", [first, Section("Second")], MADE)
         page = (tmp_path / "report.md").read_text()
         assert page.startswith("# Title\n\n## First\n\nSome text.\n\n| name")

@@ -145,7 +145,9 @@ class TestSearch:
 
     def test_what_was_kept_of_another_search_is_not_used(self, tmp_path, monkeypatch):
         score = tune.score
-        fails_at_third = Mock(side_effect=[*(score("pi", 2, 0, {}),) * 2, KeyboardInterrupt])
+        fails_at_third = Mock(
+            side_effect=[*(score("pi", {}, 2, 0, {}),) * 2, KeyboardInterrupt]
+        )
         monkeypatch.setattr(tune, "score", fails_at_third)
         search(tmp_path, runs=2, status=130)
         monkeypatch.setattr(tune, "score", score)
