@@ -34,7 +34,7 @@ NOTE = (
     "over sampled episodes."
 )
 PACKAGE = ROOT / "mptc_gym" / "bounds.json"
-MORE = 20  # episodes of the package beyond those of a score, which `ScoreCallback` runs
+MORE = 20  # episodes of the package beyond the `EPISODES` of a published score
 PACKAGED = PRESETS | {
     f"{name}, random set points": {**PRESETS[name], "setpoint": "random"}
     for name in ("paper", "disturbed", "fouling")  # for the data sets

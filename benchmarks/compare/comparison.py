@@ -82,21 +82,26 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     """
     began = time.process_time()
     members = controller.members()
-    alike = not (controller.random or is_random(scenario.parameters))
-    case = scenario.arguments, scenario.samples, 1 if alike else runs, seed
-    trajectories, tables = [member.run(*case) for member in members], []
+    all_alike = not (controller.random or is_random(scenario.parameters))
+    count = 1 if all_alike else runs
+    trajectories = [
+        member.run(scenario.arguments, scenario.samples, count, seed) for member in members
+    ]
+    tables = []
     for number, trajectory in enumerate(trajectories):
-        about = {"scenario": scenario.name, "agent": controller.name, "policy": number}
-        measures = measure(trajectory, scenario.parameters)
-        rows = {name: np.broadcast_to(values, runs) for name, values in measures.items()}
-        tables.append(pd.DataFrame({**about, "seed": range(seed, seed + runs), **rows}))
+        columns: dict[str, Any] = {"scenario": scenario.name, "agent": controller.name}
+        columns["policy"] = number
+        columns["seed"] = range(seed, seed + runs)
+        for name, values in measure(trajectory, scenario.parameters).items():
+            columns[name] = np.broadcast_to(values, runs)
+        tables.append(pd.DataFrame(columns))
     seconds = time.process_time() - began
     return Case(
         scenario.name,
         controller.name,
         pd.concat(tables, ignore_index=True),
         _responses(trajectories, scenario, controller.name),
-        [dict(each.provenance) for each in members if each.provenance],
+        [dict(member.provenance) for member in members if member.provenance],
         seconds,
         anticipation(scenario, members, trajectories, runs, seed),
     )
@@ -113,12 +118,13 @@ def _responses(members: Sequence[Trajectory], scenario: Scenario, agent: str) ->
     interval = scenario.parameters.sampling_interval
     columns = {"agent": agent, "sample": k, "time_s": k * interval, "setpoint": setpoint}
     for signal in ("output", "applied"):
-        values = np.hstack([getattr(each, signal) for each in members])
+        values = np.hstack([getattr(trajectory, signal) for trajectory in members])
         columns[f"{signal}_run"] = values[:, 0]
+        if scenario.parameters.setpoint == "random":
+            values = values[:, :1]
         # Values that occurred: an interpolated applied input could lie in the dead zone.
-        drawn = scenario.parameters.setpoint == "random"
-        found = percentiles(values[:, :1] if drawn else values, "nearest")
-        columns |= {f"{signal}_{name}": of_runs for name, of_runs in found.items()}
+        for name, percentile in percentiles(values, "nearest").items():
+            columns[f"{signal}_{name}"] = percentile
     return pd.DataFrame(columns)
 
 
