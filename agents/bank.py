@@ -69,10 +69,10 @@ class Estimate:
     log_constant: Array
     """Natural logarithm of the time constant in samples."""
     constant_spread: Array
-    rate: Array
-    """How far the mean model moves towards a new steady state in one sample, as a share."""
+    pole: Array
+    """Pole of the mean model that belongs to its time constant."""
     fading: Array
-    """Share of a deviation that remains after the delay and 1.5 samples."""
+    """Share of a slow deviation that remains when the next flow shows, d + 1 samples later."""
 
 
 def second_order(time_constants: Array) -> tuple[Array, Array, Array, Array]:
@@ -140,8 +140,8 @@ class Bank:
         self._delays = delays.astype(np.float32)
         self._logarithms = np.log(self.time_constants)
         poles = np.exp(-1.0 / self.time_constants)
-        self._rates = 1.0 - poles
-        self._fading = poles ** (self._delays[:, np.newaxis] + 1.5)
+        self._poles = poles
+        self._fading = poles ** (self._delays[:, np.newaxis] + 1.0)
         self._coefficients = second_order(self.time_constants)
 
         def zeros(*shape: int) -> Array:
@@ -164,6 +164,11 @@ class Bank:
         self._plants = np.arange(self.n)
         self.innovation = zeros(self.n)
         self._design()
+
+    @property
+    def variance(self) -> Array:
+        """Variance of the one-step errors, of the authority squared, shape (n,)."""
+        return self._variance
 
     @property
     def noise(self) -> Array:
@@ -244,7 +249,7 @@ class Bank:
             delay_spread=delay_spread,
             log_constant=log_constant,
             constant_spread=constant_spread,
-            rate=(by_constant * self._rates).sum(0) / gain,
+            pole=(by_constant * self._poles).sum(0) / gain,
             fading=np.einsum("dtn,dtn->n", weights, self._fading),
         )
 

@@ -1,9 +1,9 @@
-"""Control plants by what a bank of models predicts.
+"""Control plants by what a bank of models and a filter of the load predict.
 
 As in a Smith predictor, the response to past flows is known before the delay is over. What the
-models do not explain, the *residual*, is a load that has to be forecast to the end of the
-delay. The law is written once for NumPy, in which it runs, and PyTorch, in which a network that
-corrects it is trained. Quantities are scaled as in `agents.bank`.
+models do not explain is forecast to the end of the delay. The flow is chosen such that the
+output approaches its target. The law is written once for NumPy, in which it runs, and PyTorch,
+in which a network that corrects it is trained. Quantities are scaled as in `agents.bank`.
 """
 
 from __future__ import annotations
@@ -16,35 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import avoid_dead_zone
-from agents.bank import Bank, Estimate, second_order
+from agents.bank import LAGS, LEAST_NOISE, Bank, Estimate, second_order
+from agents.hedge import RandomSetpoint
+from agents.load import LOAD_CHANGES, LoadFilter
 
 Array = NDArray[np.floating[Any]]
 
-# Weights of the newest sample in running means of the load: over 3 to 100 samples.
-LOAD_RATES: Final = np.array([[0.3], [0.1], [0.03], [0.01]], np.float32)
-# The same of the residual: over 1 to 4 samples, as far as noise is to be averaged.
-RESIDUAL_RATES: Final = np.array([[1.0], [0.5], [0.25]], np.float32)
-# Logarithms of the means' shares in the forecast, which the network changes.
-LOAD_PREFERENCE: Final = np.array([-2.0, -1.0, 1.0, 0.0], np.float32)
-RESIDUAL_PREFERENCE: Final = np.array([-1.0, 1.0, 0.0], np.float32)
-APPROACH: Final = -0.7  # logit of the share of the way to the target that a sample should cover
+SHARE: Final = 0.5  # of the way to the target that a sample covers, without a network
+FORECAST_SPREAD: Final = 1.2  # error of a forecast over the delay, in units of the noise
+REACTION: Final = 2.0  # samples after the delay, by which the output follows a flow
 OUTLIER: Final = 12.0  # multiples of the noise, beyond which a network sees no difference
 DOUBT: Final = 0.002  # of the authority, added to the noise that signals are divided by
-HEDGED: Final = 0.03  # of the authority, noise above which a hedge gains something
-# Where there is less noise than this, of the authority, nothing is to be filtered: the newest
-# samples tell most, and the law is linear, with these additions to the preferences.
-CALM: Final = 0.04
-CALM_LOAD: Final = np.array([6.0, 0.0, -3.0, -3.0], np.float32)
-CALM_RESIDUAL: Final = np.array([2.0, -2.0, -2.0], np.float32)
-LONGEST_HOLD: Final = 300.0  # samples, age of a set point beyond which it is not counted
 TYPICAL_DELAY: Final = 18.0  # samples, that of (28)
 TYPICAL_LOG_CONSTANT: Final = 3.0  # natural logarithm of its time constant in samples
 
-PAST_INPUTS: Final = 34
+# Of a network: what it sees of the past, and of the law's state; and what it corrects.
+PAST_INPUTS: Final = 21 + LAGS + len(LOAD_CHANGES)
 INPUTS: Final = PAST_INPUTS + 5
-OUTPUTS: Final = 5 + len(LOAD_RATES) + len(RESIDUAL_RATES)
+OUTPUTS: Final = 3
 
-# From inputs, shape (n, INPUTS), to outputs, shape (n, OUTPUTS), which are `Corrections`.
+# From inputs, shape (n, INPUTS), to outputs, shape (n, OUTPUTS).
 Network = Callable[[Any], Any]
 
 
@@ -52,67 +43,46 @@ Network = Callable[[Any], Any]
 class Situation:
     """What n loops have seen so far, by which they choose their flows."""
 
-    setpoint: Array
+    targets: Array
+    """Outputs that the flows are to bring about, less the forecast residuals, shape (n,)."""
     estimate: Estimate
     noise: Array
-    """Standard deviation of one-step errors and `DOUBT`, of the authority."""
-    residuals: Array
-    """Running means of the residual, shape (3, n)."""
-    loads: Array
-    """Running means of the load, shape (4, n)."""
+    """Standard deviation of one-step errors and `DOUBT`, of the authority, shape (n,)."""
     inputs: Array
-    """What a network sees of it, shape (n, PAST_INPUTS)."""
-
-
-@dataclass(frozen=True)
-class Corrections:
-    """What a network changes in the law; all are 0 in the linear law. Shape (n,) or (n, m)."""
-
-    forecast: Any
-    """Addition to the forecast of the residual, in units of the noise."""
-    share: Any
-    """Addition to the logit of the share of the way to the target that a sample covers."""
-    flow: Any
-    """Addition to the flow."""
-    gain: Any
-    """Logarithm of a factor of the flow."""
-    hedge: Any
-    """Share by which the target falls short of the set point, which may change before the
-    flow shows."""
-    load: Any
-    """Additions to `LOAD_PREFERENCE`."""
-    residual: Any
-    """Additions to `RESIDUAL_PREFERENCE`."""
-
-    @classmethod
-    def of(cls, outputs: Any) -> Corrections:
-        """Return those of a network's outputs, shape (n, OUTPUTS).
-
-        The factors make a change of 1 in any output matter about as much as in the others.
-        """
-        first_residual = 5 + len(LOAD_RATES)
-        return cls(
-            forecast=outputs[:, 0],
-            share=2.0 * outputs[:, 1],
-            flow=0.3 * outputs[:, 2],
-            gain=0.5 * outputs[:, 3],
-            hedge=outputs[:, 4],
-            load=2.0 * outputs[:, 5:first_residual],
-            residual=2.0 * outputs[:, first_residual:],
-        )
+    """What a network sees of the past, shape (n, PAST_INPUTS)."""
 
 
 class Observer:
-    """The memory of the law without gradients: bank, loads, age of the set point."""
+    """The memory of the law: bank of models, filter of the load, and age of the set point.
 
-    def __init__(self, bank: Bank, edge: Array, limits: tuple[Array, Array]) -> None:
+    Nothing in it has a gradient.
+
+    Parameters
+    ----------
+    bank
+        The bank of models, for n loops at rest.
+    edge
+        Widest edge of the dead zone, of half the range, shape (n,); 0 without one.
+    limits
+        Lowest and highest flow, each of shape (n,).
+    setpoint
+        How set points change at random, with amplitudes as shares of the authority; None if
+        they do not change, or if nothing is known of their changes.
+    """
+
+    def __init__(
+        self,
+        bank: Bank,
+        edge: Array,
+        limits: tuple[Array, Array],
+        setpoint: RandomSetpoint | None = None,
+    ) -> None:
         self.bank = bank
         self._edge = edge
         self._centre = (limits[0] + limits[1]) / 2.0
-        self._loads = np.zeros((len(LOAD_RATES), bank.n), np.float32)
-        self._residuals = np.zeros((len(RESIDUAL_RATES), bank.n), np.float32)
-        self._age = np.zeros(bank.n, np.float32)
-        self._newest_residual = np.zeros(bank.n, np.float32)
+        self._random = setpoint
+        self._filter = LoadFilter(bank.n)
+        self._age = np.zeros(bank.n)  # samples since the set point changed
         self._setpoint: Array | None = None
         self._k = 0
 
@@ -121,40 +91,43 @@ class Observer:
         bank = self.bank
         bank.observe(output)
         estimate = bank.estimate
+        self._filter.update(bank.residuals[0], bank.residuals[1], estimate.pole, bank.variance)
+        forecast = self._filter.forecast(estimate.pole, estimate.fading)
         if self._setpoint is None:
             self._setpoint = setpoint
         self._age = np.where(setpoint == self._setpoint, self._age + 1.0, 0.0)
         self._setpoint = setpoint
-        # Since the last sample, the mean model may have changed, and the residual with it.
-        changed = bank.residuals[1] - self._newest_residual
-        self._newest_residual = bank.residuals[0]
-        self._residuals = self._residuals + changed
-        self._residuals += RESIDUAL_RATES * (bank.residuals[0] - self._residuals)
-        residual = (bank.residuals[0] + bank.residuals[1]) / 2.0
-        before = (bank.residuals[1] + bank.residuals[2]) / 2.0
-        # The steady load that would have moved the residual like this.
-        load = before + (residual - before) / estimate.rate
-        innovation = load - self._loads[0]
-        self._loads = self._loads + LOAD_RATES * (load - self._loads)
+        held = np.ones(bank.n)
+        aim = setpoint
+        if self._random is not None:
+            held = self._random.probability_held(self._age, estimate.delay + 1.0 + REACTION)
+            aim = self._random.targets(setpoint, held, FORECAST_SPREAD * bank.noise)
         noise = bank.noise + DOUBT
-        inputs = self._inputs(setpoint, output, noise, innovation)
+        inputs = self._inputs(output, aim, held, forecast, noise)
         self._k += 1
-        return Situation(setpoint, estimate, noise, self._residuals, self._loads, inputs)
+        targets = (aim - forecast).astype(np.float32)
+        return Situation(targets, estimate, noise, inputs)
 
-    def _inputs(self, setpoint: Array, output: Array, noise: Array, innovation: Array) -> Array:
+    def _inputs(
+        self, output: Array, aim: Array, held: Array, forecast: Array, noise: Array
+    ) -> Array:
         """Return what a network sees of the past, shape (n, PAST_INPUTS)."""
-        bank, loads, estimate = self.bank, self._loads, self.bank.estimate
-        trends = (loads[:-1] - loads[1:]) / np.sqrt(LOAD_RATES[:-1])
-        age = np.minimum(self._age, LONGEST_HOLD) / 100.0
+        bank, estimate = self.bank, self.bank.estimate
+        setpoint = self._setpoint
+        assert setpoint is not None
+        loads = self._filter.loads
         signals = [
             setpoint,
+            np.abs(setpoint),
+            aim - setpoint,
+            held,
             output,
-            *loads,
+            loads,
+            forecast - loads,
             *_limited(bank.residuals / noise),
-            *_limited(self._residuals[1:] / noise),
             _limited(bank.innovation / noise),
-            _limited(innovation * estimate.rate / noise),
-            *_limited(trends * estimate.rate / noise),
+            _limited(self._filter.innovations / noise),
+            *self._filter.weights,
             3.0 * np.log(estimate.gain),
             5.0 * estimate.gain_spread,
             (estimate.delay - TYPICAL_DELAY) / 10.0,
@@ -165,13 +138,8 @@ class Observer:
             2.0 * estimate.fading - 1.0,
             self._edge,
             self._centre,
-            age,
-            np.maximum(age - 1.0, 0.0),
-            2.0 * np.maximum(age - 2.0, 0.0),
-            4.0 * np.maximum(age - 2.5, 0.0),
-            np.abs(setpoint),
-            np.full_like(setpoint, min(self._k / 600.0, 2.0)),
-            np.full_like(setpoint, min(self._k / 60.0, 1.0)),
+            np.full(bank.n, min(self._k / 600.0, 2.0)),
+            np.full(bank.n, min(self._k / 60.0, 1.0)),
         ]
         return np.stack(signals, axis=1).astype(np.float32)
 
@@ -185,9 +153,9 @@ def _limited(signals: Array) -> Array:
 class Law:
     """The law of n loops: from what they have seen, and a network's corrections, to flows.
 
-    The target is the set point less the forecast of the residual, which fades to the load over
-    the delay. The flow holds the model's output at the target, and moves it there by a share a
-    sample. A network corrects this; see `Corrections`.
+    The flow holds the mean model's output at the target, and moves it there by a share a
+    sample. A network corrects the target, in units of the noise; the target, as far as the gain
+    is uncertain; and the share.
 
     Parameters
     ----------
@@ -215,49 +183,45 @@ class Law:
         self._edge = convert(edge)
         self._low, self._high = map(convert, limits)
         self._coefficients = tuple(map(convert, second_order(bank.time_constants)))
-        self._load_preference = convert(LOAD_PREFERENCE)
-        self._residual_preference = convert(RESIDUAL_PREFERENCE)
-        self._calm_load, self._calm_residual = convert(CALM_LOAD), convert(CALM_RESIDUAL)
-        # The undelayed responses of the models, their last ones, and the last flow.
+        # The undelayed responses of the models, those of a sample before, and the last flow.
         self._response = convert(np.zeros_like(bank.time_constants))
         self._before = self._response
         self._flow = convert(np.zeros(bank.n, np.float32))
 
-    def flow(self, situation: Situation, network: Network) -> Any:
-        """Return the flows, shape (n,), which pass the dead zone or are 0."""
-        xp, convert, estimate = self._xp, self._convert, situation.estimate
-        gains, gain, fading = map(convert, (estimate.gains, estimate.gain, estimate.fading))
-        noise, setpoint = convert(situation.noise), convert(situation.setpoint)
-        loads, residuals = convert(situation.loads), convert(situation.residuals)
-        model = (gains * self._response).sum(0)
-        slope = model - (gains * self._before).sum(0)
-        gap = setpoint - fading * residuals[1] - (1.0 - fading) * loads[2] - model
-        signals = [model, 10.0 * slope, gap, self._flow, gap / (abs(gap) + 2.0 * noise)]
-        past = convert(situation.inputs)
-        inputs = xp.concatenate([past, xp.stack(signals, axis=1)], axis=1)
-        calm = (1.0 / (1.0 + (noise / CALM) ** 6))[:, None]
-        corrections = Corrections.of((1.0 - calm) * network(inputs))
+    def flow(self, situation: Situation, network: Network | None = None) -> Any:
+        """Return the flows, shape (n,), which pass the dead zone or are 0.
 
-        load_logits = corrections.load + self._load_preference + calm * self._calm_load
-        load = self._mean(loads, load_logits)
-        residual_logits = corrections.residual + self._residual_preference
-        residual = self._mean(residuals, residual_logits + calm * self._calm_residual)
-        forecast = fading * residual + (1.0 - fading) * load + noise * corrections.forecast
-        hedge = corrections.hedge * noise**2 / (noise**2 + HEDGED**2)
-        target = setpoint * (1.0 - hedge) - forecast
-        share = 1.0 / (1.0 + self._exp(-corrections.share - APPROACH))
-        wanted = (target + share / convert(estimate.rate) * (target - model)) / gain
-        wanted = wanted * self._exp(corrections.gain) + corrections.flow
-        return self._passing(wanted)
+        Without a network, the law is linear but for the dead zone and the limits.
+        """
+        convert = self._convert
+        estimate = situation.estimate
+        gain = convert(estimate.gain)
+        gains = convert(estimate.gains)
+        rate = 1.0 - convert(estimate.pole)
+        target = convert(situation.targets)
+        model = (gains * self._response).sum(0)
+        share: Any = SHARE
+        if network is not None:
+            slope = model - (gains * self._before).sum(0)
+            outputs = network(self._inputs(situation, model, slope))
+            excess = convert(situation.noise - LEAST_NOISE - DOUBT)
+            spread = convert(estimate.gain_spread)
+            target = target * (1.0 + spread * outputs[:, 1]) + excess * outputs[:, 0]
+            share = 1.0 / (1.0 + self._exp(-2.0 * outputs[:, 2]))
+        return self._passing((target + share / rate * (target - model)) / gain)
+
+    def _inputs(self, situation: Situation, model: Any, slope: Any) -> Any:
+        """Return what a network sees, shape (n, INPUTS)."""
+        xp = self._xp
+        gap = self._convert(situation.targets) - model
+        noise = self._convert(situation.noise)
+        signals = [model, 10.0 * slope, gap, self._flow, gap / (abs(gap) + 2.0 * noise)]
+        past = self._convert(situation.inputs)
+        return xp.concatenate([past, xp.stack(signals, axis=1)], axis=1)
 
     def _exp(self, exponents: Any) -> Any:
         """Return exponentials, without an overflow where a network sees nonsense."""
         return self._xp.exp(self._xp.clip(exponents, -20.0, 20.0))
-
-    def _mean(self, values: Any, logits: Any) -> Any:
-        """Return the mean of values, shape (m, n), by their logits, shape (n, m)."""
-        shares = self._exp(logits)
-        return (shares * values.T).sum(1) / shares.sum(1)
 
     def _passing(self, wanted: Any) -> Any:
         """Return flows that pass the dead zone and the limits, and let the models follow them.

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.bank import Bank, Prior
-from agents.controller import Index, ModelBasedController
-from agents.law import OUTPUTS, Law, Observer
+from agents.controller import Index, ModelBasedController, Positive
+from agents.hedge import RandomSetpoint
+from agents.law import Law, Network, Observer
 from agents.recurrent import RecurrentNetwork
 
 Array = NDArray[np.floating[Any]]
@@ -54,11 +55,21 @@ class SelfTuningController(ModelBasedController):
         Shortest and longest delay that the plant may have, s, including the one sample that any
         input takes to show; they are then equally likely. By default the delay is from a third
         to twice that of the step test, and the more likely the nearer.
+    setpoint_holds
+        Shortest and longest time, s, for which a random level of the set point is held, if its
+        levels are known to be random; each time between them is equally likely. The target then
+        falls short of a set point that may change before a flow shows. By default, nothing is
+        known of changes of the set point.
+    setpoint_amplitude
+        Greatest level of a random set point, degC. The levels are uniform between its negative
+        and this.
     setpoint_index, error_index
         Indices of y_d(k) and e(k), degC, in the observation.
     """
 
     delay_range: tuple[float, float] | None = None
+    setpoint_holds: tuple[float, float] | None = None
+    setpoint_amplitude: Positive = 5.0
     setpoint_index: Index = 0
     error_index: Index = 3
 
@@ -80,7 +91,8 @@ class SelfTuningController(ModelBasedController):
         likely = self.delay / interval
         shortest, longest = DELAYS[0] * likely, DELAYS[1] * likely
         if self.delay_range is not None:
-            shortest, longest = (limit / interval for limit in _check_range(self.delay_range))
+            limits = _check_range("delay_range", self.delay_range)
+            shortest, longest = (limit / interval for limit in limits)
         first = max(math.floor(shortest + 0.5) - 1, 0)
         last = max(math.floor(longest + 0.5) - 1, first)
         count = last - first + 1
@@ -135,7 +147,7 @@ class SelfTuningController(ModelBasedController):
         low, high = sorted([self.u_min / self._unit_flow, self.u_max / self._unit_flow])
         limits = np.full(n, low, np.float32), np.full(n, high, np.float32)
         self._bank = Bank(self._prior(n))
-        self._observer = Observer(self._bank, edges, limits)
+        self._observer = Observer(self._bank, edges, limits, self._random_setpoint())
         self._law = Law(self._bank, edges, limits)
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -147,27 +159,35 @@ class SelfTuningController(ModelBasedController):
             situation = self._observer.observe(
                 setpoint.astype(np.float32), output.astype(np.float32)
             )
-            flow = self._law.flow(situation, self._corrections)
+            flow = self._law.flow(situation, self._network())
             self._bank.apply(flow)
             self._held = self._unit_flow * flow.astype(np.float64)
         self._k += 1
         command: NDArray[np.float64] = self._held
         return command
 
-    def _corrections(self, inputs: Array) -> Array:
-        """Return the corrections of the law, shape (n, OUTPUTS): none, so it is linear."""
-        return np.zeros((len(inputs), OUTPUTS), np.float32)
+    def _random_setpoint(self) -> RandomSetpoint | None:
+        """Return how the set point changes at random, in samples and of the authority."""
+        if self.setpoint_holds is None:
+            return None
+        limits = _check_range("setpoint_holds", self.setpoint_holds)
+        shortest, longest = (limit / self.sampling_interval / self._every for limit in limits)
+        return RandomSetpoint(shortest, longest, self.setpoint_amplitude / abs(self._authority))
+
+    def _network(self) -> Network | None:
+        """Return what corrects the law: nothing, so it is linear."""
+        return None
 
 
-def _check_range(limits: Any) -> tuple[float, float]:
-    """Return the limits of `delay_range` if they are valid; otherwise raise a ValueError."""
+def _check_range(name: str, limits: Any) -> tuple[float, float]:
+    """Return the limits of a range of times, s, if they are valid; otherwise a ValueError."""
     try:
         shortest, longest = map(float, limits)
     except (TypeError, ValueError):
         shortest = longest = math.nan
     if not 0.0 <= shortest <= longest < math.inf:
         raise ValueError(
-            "delay_range must be two finite numbers of at least 0, the shortest delay first, "
+            f"{name} must be two finite numbers of at least 0, the shortest time first, "
             f"got {limits!r}"
         )
     return shortest, longest
@@ -193,8 +213,12 @@ class NeuralSelfTuningController(SelfTuningController):
         super()._start(n)
         self._state = self.network.initial_state(n)
 
-    def _corrections(self, inputs: Array) -> Array:
-        """Return the corrections that the network chooses, shape (n, OUTPUTS)."""
+    def _network(self) -> Network:
+        """Return the network with its state, as a function of inputs."""
+        return self._outputs
+
+    def _outputs(self, inputs: Array) -> Array:
+        """Return the network's outputs, shape (n, OUTPUTS), and keep its next state."""
         outputs, self._state = self.network.step(inputs, self._state)
         return outputs
 

@@ -31,7 +31,7 @@ from mptc_gym.wrappers.vector import IncrementalAction
 from tests.conftest import ROOT
 
 SMALL = Training(
-    steps=2, second_steps=1, plants=4, segment=60, nodes=3, hidden=2, validation_episodes=2
+    steps=2, plants=4, segment=60, nodes=3, hidden=2, validation_episodes=2
 )
 RECIPE = replace(
     ppo.RECIPES["ppo"],

@@ -32,6 +32,7 @@ from benchmarks.controllers.spec import (
     EVERYTHING,
     LIMITS,
     ROBUSTNESS,
+    SETPOINT,
     STEP_TEST,
     ControllerSpec,
 )
@@ -235,7 +236,7 @@ _SPECS = (
         label="neural Smith",
         look=("#0072B2", "^"),
         build=NeuralSmithPredictor,
-        prior_knowledge=DATA_SHEET,
+        prior_knowledge=(*DATA_SHEET, *SETPOINT),
         knows=_DATA_SHEET,
         searched=f"{_LAW}; one step test",
         networks=_NETWORK,

@@ -11,6 +11,7 @@ from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.linear import LinearLoop, nominal, step_test, time_constant_for
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from mptc_gym import Parameters
+from mptc_gym.signals import Levels
 
 LEARNING = 1200  # samples of the square wave on which a network is commissioned
 COMMISSIONING_SEED = SEEDS["preparation"].first  # of plants and noise during commissioning
@@ -21,7 +22,8 @@ LIMITS = "u_min", "u_max"
 DIRECTION = *LIMITS, "direction", "num_envs", "seed"
 STEP_TEST = *LIMITS, "gain", "time_constant", "delay", "sampling_interval"
 DATA_SHEET = *STEP_TEST, "dead_zone"
-BANK = *STEP_TEST, "widest_dead_zone", "delay_range"
+SETPOINT = "setpoint_holds", "setpoint_amplitude"
+BANK = *STEP_TEST, "widest_dead_zone", "delay_range", *SETPOINT
 EVERYTHING = "parameters", "num_envs", "seed"
 
 
@@ -37,6 +39,8 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
     values["dead_zone"] = sum(plant.range_of("dead_zone")) / 2
     values["widest_dead_zone"] = plant.range_of("dead_zone")[1]
     values["delay_range"] = delay_range(plant)
+    values["setpoint_holds"] = setpoint_holds(plant)
+    values["setpoint_amplitude"] = plant.setpoint_amplitude
     if "direction" in names:
         values["direction"] = plant_scale.direction(plant)
     if "gain" in names:
@@ -54,6 +58,14 @@ def delay_range(plant: Parameters) -> tuple[float, float] | None:
     shortest, longest = plant.delay
     interval = plant.sampling_interval
     return (shortest + 1) * interval, (longest + 1) * interval
+
+
+def setpoint_holds(plant: Parameters) -> tuple[float, float] | None:
+    """Return for how long a random set point is held, s; None if it is not random."""
+    levels = Levels(plant)
+    if not levels.random:
+        return None
+    return levels.shortest * plant.sampling_interval, levels.longest * plant.sampling_interval
 
 
 @dataclass(frozen=True, kw_only=True)

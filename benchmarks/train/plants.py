@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from agents.bank import Prior
+from agents.hedge import RandomSetpoint
 from agents.self_tuning import CLEARANCE, GAIN_SPREAD, TIME_CONSTANTS
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.torch_env import MiddlePointTorchEnv
@@ -20,6 +21,7 @@ POLE: Final = float(np.abs(np.roots(PAPER.a)).max())  # of the dominant time con
 HALF_RANGE: Final = (PAPER.range_of("u_max")[1] - PAPER.range_of("u_min")[0]) / 2.0  # t/h
 HARD: Final = PRESETS["hard"]
 HOLDS: Final = (100, 300)  # samples, lengths of the levels of a random set point
+UNCHANGED: Final = 1e30  # samples, for which a set point is held that does not change by chance
 DELAYS: Final = 13  # in the bank of each plant
 # Ranges of the environment's arguments; every episode gets its own numbers within them.
 RANGES: Final[dict[str, Any]] = {
@@ -53,6 +55,8 @@ class Batch:
     """Whether a set point changes as in `hard`, at random, shape (n,)."""
     amplitudes: Tensor
     """Largest set point, degC, shape (n,)."""
+    random_setpoint: RandomSetpoint
+    """What the controllers know of the changes of the set points, of the authority."""
     prior: Prior
     authorities: np.ndarray[Any, np.dtype[np.float32]]
     """Steady effect of half the range of flows in the step test, degC, shape (n,)."""
@@ -111,6 +115,12 @@ class Sampler:
         prior, gains = self._knowledge(numbers, hard, exact)
         widest = numbers["dead_zone"] + self._uniform(0.0, 3.0) * ~exact
         widest = torch.where(hard, HARD["dead_zone"][1], widest.clamp(max=8.0))
+        authorities = (gains * GAIN * HALF_RANGE).numpy()
+        random_setpoint = RandomSetpoint(
+            shortest=np.where(hard, HOLDS[0], 0.0),
+            longest=np.where(hard, HOLDS[1], UNCHANGED),
+            amplitude=amplitudes.numpy() / authorities,
+        )
         return Batch(
             numbers=numbers,
             setpoints=setpoints,
@@ -118,8 +128,9 @@ class Sampler:
             innovations=innovations,
             changes_by_surprise=hard,
             amplitudes=amplitudes,
+            random_setpoint=random_setpoint,
             prior=prior,
-            authorities=(gains * GAIN * HALF_RANGE).numpy(),
+            authorities=authorities,
             edges=(widest / HALF_RANGE + CLEARANCE).numpy(),
         )
 
