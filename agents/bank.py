@@ -58,11 +58,8 @@ class Prior:
 class Estimate:
     """What a bank knows of n plants: means over its models and their standard deviations."""
 
-    gains: Array
-    """Gain times probability of the models with a time constant, shape (time constants, n)."""
-    gain: Array
-    """Steady-state gain, as a multiple of the step test's."""
-    gain_spread: Array
+    shares: Array
+    """Probabilities of the time constants, shape (time constants, n)."""
     delay: Array
     """Delay d of (28), samples."""
     delay_spread: Array
@@ -114,7 +111,7 @@ class Bank:
     as for a Gaussian density. Both forget exponentially.
 
     At each sample, `observe` the output, then `apply` the flow. In between, `estimate`,
-    `noise`, `innovation` and `residuals` tell what is known.
+    `noise`, `innovation`, `outputs` and `responses` tell what is known.
 
     Attributes
     ----------
@@ -124,16 +121,17 @@ class Bank:
         Standard deviation of the one-step errors, of the authority.
     innovation : ndarray
         The newest one-step error.
-    residuals : ndarray
-        Parts of the latest outputs that the mean model does not explain, newest first, shape
-        (LAGS, n).
+    outputs, responses : ndarray
+        The latest outputs, and the responses s of the mean model at the same samples, newest
+        first, shape (LAGS, n).
     """
 
     def __init__(self, prior: Prior) -> None:
         self.time_constants = np.asarray(prior.time_constants, np.float32)
         self._prior = np.asarray(prior.log_probabilities, np.float32)
         self._shortest = np.asarray(prior.shortest_delays, np.intp)
-        self._gain_variance = np.square(np.asarray(prior.gain_spread, np.float32))
+        self.gain_spread = np.asarray(prior.gain_spread, np.float32)
+        self._gain_variance = np.square(self.gain_spread)
         models = self._prior.shape
         self._count, constants, self.n = models
         delays = self._shortest + np.arange(self._count)[:, np.newaxis]
@@ -155,7 +153,8 @@ class Bank:
         self._regressors = zeros(*models)
         self._whiten_output = Whitening((self.n,))
         self._whiten_response = Whitening((constants, self.n))
-        self._outputs = zeros(LAGS, self.n)
+        self.outputs = zeros(LAGS, self.n)
+        self.responses = zeros(LAGS, self.n)
         # Sums over the past with forgetting.
         self._information, self._products = zeros(*models), zeros(*models)
         self._log_likelihoods = zeros(*models)
@@ -178,21 +177,23 @@ class Bank:
 
     def observe(self, output: Array) -> None:
         """Learn from the output y(k), shape (n,)."""
-        self._outputs[1:] = self._outputs[:-1]
-        self._outputs[0] = output
+        self.outputs[1:] = self.outputs[:-1]
+        self.outputs[0] = output
         rows = (self._k - self._shortest) % len(self._undelayed)
         newest = self._undelayed[rows, :, :, self._plants].transpose(1, 2, 0)
         self._delayed[1:] = self._delayed[:-1]
         self._regressors[1:] = self._regressors[:-1]
         self._delayed[0], self._regressors[0] = newest
-        self._learn(self._whiten_output(self._outputs[0].copy()))
+        self._learn(self._whiten_output(self.outputs[0].copy()))
         self._k += 1
         if self._k % DESIGN_INTERVAL == 0:
             self._design()
-        self.residuals = self._outputs - [
-            np.einsum("dtn,dtn->n", self._effects, self._delayed[lag : lag + self._count])
-            for lag in range(LAGS)
-        ]
+        self.responses = np.stack(
+            [
+                np.einsum("dtn,dtn->n", self._weights, self._delayed[lag : lag + self._count])
+                for lag in range(LAGS)
+            ]
+        )
 
     def apply(self, flow: Array) -> None:
         """Take note of the flow f(k) that the plants receive, shape (n,)."""
@@ -228,28 +229,21 @@ class Bank:
         """Renew gains and probabilities of the models, and the means over them."""
         prior = self._variance / self._gain_variance
         information = self._information + prior
-        self._gains = gains = np.clip((self._products + prior) / information, *GAINS)
+        self._gains = np.clip((self._products + prior) / information, *GAINS)
         logarithms = self._log_likelihoods + self._prior
         logarithms -= logarithms.max((0, 1))
         self._weights = weights = np.exp(np.maximum(logarithms, UNLIKELY))
         weights /= weights.sum((0, 1))
-        self._effects = effects = weights * gains
-
-        by_constant = effects.sum(0)
-        gain = by_constant.sum(0)
-        spread = np.einsum("dtn,dtn->n", effects, gains) - gain**2
-        spread += self._variance * (weights / information).sum((0, 1))
+        shares = weights.sum(0)
         delay, delay_spread = _moments(weights.sum(1), self._delays)
-        log_constant, constant_spread = _moments(weights.sum(0), self._logarithms)
+        log_constant, constant_spread = _moments(shares, self._logarithms)
         self.estimate = Estimate(
-            gains=by_constant,
-            gain=gain,
-            gain_spread=np.sqrt(np.maximum(spread, 0.0)),
+            shares=shares,
             delay=delay,
             delay_spread=delay_spread,
             log_constant=log_constant,
             constant_spread=constant_spread,
-            pole=(by_constant * self._poles).sum(0) / gain,
+            pole=(shares * self._poles).sum(0),
             fading=np.einsum("dtn,dtn->n", weights, self._fading),
         )
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from agents.actuator import avoid_dead_zone
 from agents.bank import LAGS, LEAST_NOISE, Bank, Estimate, second_order
 from agents.hedge import RandomSetpoint
-from agents.load import LOAD_CHANGES, LoadFilter
+from agents.output_filter import LOAD_CHANGES, OutputFilter
 
 Array = NDArray[np.floating[Any]]
 
@@ -46,6 +46,10 @@ class Situation:
     targets: Array
     """Outputs that the flows are to bring about, less the forecast residuals, shape (n,)."""
     estimate: Estimate
+    gain: Array
+    """Gain, as a multiple of the step test's, shape (n,)."""
+    gain_spread: Array
+    """Standard deviation of the gain, shape (n,)."""
     noise: Array
     """Standard deviation of one-step errors and `DOUBT`, of the authority, shape (n,)."""
     inputs: Array
@@ -78,11 +82,11 @@ class Observer:
         setpoint: RandomSetpoint | None = None,
     ) -> None:
         self.bank = bank
+        self.filter = OutputFilter(bank.gain_spread)
         self._edge = edge
         self._centre = (limits[0] + limits[1]) / 2.0
         self._random = setpoint
-        self._filter = LoadFilter(bank.n)
-        self._age = np.zeros(bank.n)  # samples since the set point changed
+        self._age: Array = np.zeros(bank.n)  # samples since the set point changed
         self._setpoint: Array | None = None
         self._k = 0
 
@@ -91,13 +95,13 @@ class Observer:
         bank = self.bank
         bank.observe(output)
         estimate = bank.estimate
-        self._filter.update(bank.residuals[0], bank.residuals[1], estimate.pole, bank.variance)
-        forecast = self._filter.forecast(estimate.pole, estimate.fading)
+        self.filter.update(output, bank.responses[:2], estimate.pole, bank.variance)
+        forecast = self.filter.forecast(estimate.pole, estimate.fading)
         if self._setpoint is None:
             self._setpoint = setpoint
         self._age = np.where(setpoint == self._setpoint, self._age + 1.0, 0.0)
         self._setpoint = setpoint
-        held = np.ones(bank.n)
+        held: Array = np.ones(bank.n)
         aim = setpoint
         if self._random is not None:
             held = self._random.probability_held(self._age, estimate.delay + 1.0 + REACTION)
@@ -106,7 +110,9 @@ class Observer:
         inputs = self._inputs(output, aim, held, forecast, noise)
         self._k += 1
         targets = (aim - forecast).astype(np.float32)
-        return Situation(targets, estimate, noise, inputs)
+        gain = self.filter.gain.astype(np.float32)
+        gain_spread = self.filter.gain_spread.astype(np.float32)
+        return Situation(targets, estimate, gain, gain_spread, noise, inputs)
 
     def _inputs(
         self, output: Array, aim: Array, held: Array, forecast: Array, noise: Array
@@ -115,21 +121,22 @@ class Observer:
         bank, estimate = self.bank, self.bank.estimate
         setpoint = self._setpoint
         assert setpoint is not None
-        loads = self._filter.loads
+        load, gain = self.filter.load, self.filter.gain
+        residuals = bank.outputs - gain * bank.responses
         signals = [
             setpoint,
             np.abs(setpoint),
             aim - setpoint,
             held,
             output,
-            loads,
-            forecast - loads,
-            *_limited(bank.residuals / noise),
+            load,
+            forecast - load,
+            *_limited(residuals / noise),
             _limited(bank.innovation / noise),
-            _limited(self._filter.innovations / noise),
-            *self._filter.weights,
-            3.0 * np.log(estimate.gain),
-            5.0 * estimate.gain_spread,
+            _limited(self.filter.innovation / noise),
+            *self.filter.weights,
+            3.0 * np.log(gain),
+            5.0 * self.filter.gain_spread,
             (estimate.delay - TYPICAL_DELAY) / 10.0,
             estimate.delay_spread / 4.0,
             2.0 * (estimate.log_constant - TYPICAL_LOG_CONSTANT),
@@ -195,8 +202,8 @@ class Law:
         """
         convert = self._convert
         estimate = situation.estimate
-        gain = convert(estimate.gain)
-        gains = convert(estimate.gains)
+        gain = convert(situation.gain)
+        gains = gain * convert(estimate.shares)
         rate = 1.0 - convert(estimate.pole)
         target = convert(situation.targets)
         model = (gains * self._response).sum(0)
@@ -205,7 +212,7 @@ class Law:
             slope = model - (gains * self._before).sum(0)
             outputs = network(self._inputs(situation, model, slope))
             excess = convert(situation.noise - LEAST_NOISE - DOUBT)
-            spread = convert(estimate.gain_spread)
+            spread = convert(situation.gain_spread)
             target = target * (1.0 + spread * outputs[:, 1]) + excess * outputs[:, 0]
             share = 1.0 / (1.0 + self._exp(-2.0 * outputs[:, 2]))
         return self._passing((target + share / rate * (target - model)) / gain)

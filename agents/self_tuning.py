@@ -22,6 +22,7 @@ TIME_CONSTANTS: Final = np.array([0.63, 1.0, 1.55])  # in the bank, multiples of
 # deviation of their prior.
 DELAYS: Final = (0.33, 2.0)
 DELAY_SPREAD: Final = 0.33
+CONSTANT_SPREAD: Final = 0.3  # standard deviation of the logarithm of the time constant
 GAIN_SPREAD: Final = 0.25  # standard deviation of the gain, as a share of the step test's
 EXACT: Final = 1e-3  # the same where the gain is not estimated
 MOST_DELAYS: Final = 10_000  # in the bank; with more, it would be too large for any computer
@@ -117,7 +118,7 @@ class SelfTuningController(ModelBasedController):
             return {}
         estimate, interval = self._bank.estimate, self.sampling_interval * self._every
         return {
-            "gain": self.gain * estimate.gain,
+            "gain": self.gain * self._observer.filter.gain,
             "time_constant": interval * np.exp(estimate.log_constant),
             "delay": interval * (estimate.delay + 1.0),
         }
@@ -130,11 +131,12 @@ class SelfTuningController(ModelBasedController):
     def _prior(self, n: int) -> Prior:
         """Return what is known of n plants from the step test."""
         constants = (self._constant * TIME_CONSTANTS)[:, np.newaxis]
-        logarithms = self._log_probabilities[:, np.newaxis, np.newaxis]
+        of_constants = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
+        logarithms = self._log_probabilities[:, np.newaxis] + of_constants
         return Prior(
             time_constants=np.repeat(constants, n, axis=1),
             shortest_delays=np.full(n, self._delays[0]),
-            log_probabilities=logarithms + np.zeros((len(TIME_CONSTANTS), n)),
+            log_probabilities=np.repeat(logarithms[:, :, np.newaxis], n, axis=2),
             gain_spread=np.full(n, GAIN_SPREAD),
         )
 

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from agents import NeuralSelfTuningController, NeuralSmithPredictor, SelfTuningController
-from agents.bank import GAIN_MEMORY, LAGS, Bank, Prior, Whitening, second_order
+from agents import (
+    NeuralSelfTuningController,
+    NeuralSmithPredictor,
+    SelfTuningController,
+    output_filter,
+)
+from agents.bank import FAST_POLE, LAGS, NOISE_COLOUR, Bank, Prior, second_order
+from agents.hedge import RandomSetpoint
 from agents.law import Law, Observer
+from agents.output_filter import LOAD_MEMORY, READING_SHARE, OutputFilter
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.train.neural import Net
 from tests.conftest import STEP_TEST
@@ -91,35 +98,108 @@ def test_the_steady_state_of_the_model_is_that_of_the_step_test():
     assert outputs[-1] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_single_exact_model_leaves_what_it_does_not_explain(rng):
-    bank, flows, load = Bank(single_model(1e-3)), rng.uniform(-1.0, 1.0, 80), 0.25
-    outputs = simulated(flows) + load
-    for flow, output in zip(flows, outputs, strict=True):
-        bank.observe(np.array([output], np.float32))
+def test_the_response_of_a_single_model_is_that_of_its_difference_equation(rng):
+    bank, flows = Bank(single_model(1e-3)), rng.uniform(-1.0, 1.0, 80)
+    expected = simulated(flows)
+    for k, flow in enumerate(flows):
+        bank.observe(np.array([expected[k]], np.float32))
         bank.apply(np.array([flow], np.float32))
-    assert bank.residuals[:, 0] == pytest.approx([load] * LAGS, abs=1e-3)
+    latest = expected[: -LAGS - 1 : -1]
+    assert bank.responses[:, 0] == pytest.approx(latest, abs=1e-5)
 
 
-def test_the_gain_is_that_of_weighted_least_squares(rng):
-    spread, samples = 0.3, 61
-    bank, flows = Bank(single_model(spread)), rng.uniform(-1.0, 1.0, samples)
-    responses = simulated(flows)
-    outputs = 1.2 * responses + 0.1 * rng.normal(size=samples)
-    filters = Whitening((1,)), Whitening((1,))
-    regressors, whitened, noises = [], [], []
-    for flow, output, response in zip(flows, outputs, responses, strict=True):
-        bank.observe(np.array([output], np.float32))
-        bank.apply(np.array([flow], np.float32))
-        regressors.append(filters[0](np.array([response]))[0])
-        whitened.append(filters[1](np.array([output]))[0])
-        noises.append(bank.noise[0])
-    newest = samples - 1 - (samples % 2)  # the sample of the latest design
-    kept = slice(0, newest + 1)
-    weights = GAIN_MEMORY ** np.arange(newest, -1, -1)
-    x, y, prior = np.array(regressors)[kept], np.array(whitened)[kept], noises[newest] / spread
-    expected = (weights @ (x * y) + prior**2) / (weights @ (x * x) + prior**2)
-    assert expected > 1.1
-    assert bank.estimate.gain[0] == pytest.approx(expected, rel=1e-4)
+class TestOutputFilter:
+    POLE, VARIANCE, SPREAD, SAMPLES = 0.95, 0.04, 0.3, 60
+
+    def filtered(self, responses, outputs):
+        """Return the filter after all samples."""
+        kalman = OutputFilter([self.SPREAD])
+        pole, variance = np.array([self.POLE]), np.array([self.VARIANCE])
+        for k in range(1, len(outputs)):
+            newest = responses[[k, k - 1], np.newaxis]
+            kalman.update(outputs[[k]], newest, pole, variance)
+        return kalman
+
+    def test_gain_and_load_are_those_of_all_samples_at_once(self, rng, monkeypatch):
+        # The unknowns and the outputs are jointly normal: condition them in one step.
+        change, drift = 0.02, output_filter.GAIN_CHANGE * self.SPREAD / 0.25
+        monkeypatch.setattr(output_filter, "LOAD_CHANGES", np.array([change]))
+        samples = self.SAMPLES
+        responses = np.concatenate([[0.0], np.cumsum(rng.normal(size=samples)) / 5.0])
+        outputs = 1.1 * responses + 0.2 * rng.normal(size=samples + 1)
+        a1, a2 = self.POLE + FAST_POLE, -self.POLE * FAST_POLE
+        # Responses of v(k), k = 1 to the last, to unit xi(j) and eta(j).
+        of_noise, of_load = np.zeros((2, samples, samples))
+        for j in range(samples):
+            noise, load, w = np.zeros(samples + 2), np.zeros(samples + 2), 0.0
+            for k in range(samples):
+                xi = float(k == j) + NOISE_COLOUR[0] * float(k == j + 1)
+                w = LOAD_MEMORY * w + float(k == j)
+                noise[k] = a1 * noise[k - 1] + a2 * noise[k - 2] + xi
+                load[k] = a1 * load[k - 1] + a2 * load[k - 2] + (1.0 - a1 - a2) * w
+            of_noise[:, j], of_load[:, j] = noise[:samples], load[:samples]
+        s = responses[1:]
+        walks = np.minimum.outer(np.arange(1, samples + 1), np.arange(1, samples + 1))
+        gains = self.SPREAD**2 + drift**2 * walks
+        weights = LOAD_MEMORY ** np.arange(samples - 1, -1, -1)  # of eta in the last w
+        covariance = (1.0 - READING_SHARE) * self.VARIANCE * of_noise @ of_noise.T
+        covariance += change**2 * of_load @ of_load.T + s[:, None] * gains * s
+        covariance += READING_SHARE * self.VARIANCE * np.eye(samples)
+        surprise = np.linalg.solve(covariance, outputs[1:] - s)
+        kalman = self.filtered(responses, outputs)
+        assert kalman.gain[0] == pytest.approx(1.0 + gains[-1] * s @ surprise, abs=1e-9)
+        load = change**2 * (of_load @ weights) @ surprise
+        assert kalman.load[0] == pytest.approx(load, abs=1e-9)
+
+    def test_a_steady_load_is_told_from_noise_by_the_likelier_filter(self, rng):
+        noise = 0.2 * rng.normal(size=600)
+        calm = self.filtered(np.zeros(600), noise)
+        loaded = self.filtered(np.zeros(600), noise + 2.0 * (np.arange(600) > 300))
+        # The first filter expects the smallest changes of the load.
+        assert calm.weights[0, 0] > 0.4 > loaded.weights[0, 0]
+        assert loaded.load[0] == pytest.approx(2.0, abs=0.3)
+
+    def test_a_load_remains_in_the_forecast_and_noise_does_not(self):
+        pole, fading = np.array([self.POLE]), np.array([self.POLE**19])
+        steady = np.full(200, 0.7)
+        pulse = np.where(np.arange(200) == 199, 0.7, 0.0)
+        of_load, of_noise = (
+            self.filtered(np.zeros(200), outputs).forecast(pole, fading)[0]
+            for outputs in (steady, pulse)
+        )
+        assert 0.55 < of_load < 0.7
+        assert 0.0 < of_noise < 0.2
+
+
+class TestRandomSetpoint:
+    SETPOINT = RandomSetpoint(shortest=100.0, longest=300.0, amplitude=5.0)
+
+    def test_the_chance_to_be_held_is_that_of_counted_lengths(self):
+        lengths = np.arange(100, 301)
+        for age, ahead in ((0, 19), (85, 19), (150, 25), (270, 19)):
+            going = lengths[lengths > age]
+            share = (going > age + ahead).mean()
+            held = self.SETPOINT.probability_held(np.array([age]), np.array([ahead]))
+            assert held[0] == pytest.approx(share, abs=1e-12)
+
+    def test_no_other_target_has_less_error(self, rng):
+        levels = rng.uniform(-5.0, 5.0, 200_000)
+        noise = rng.logistic(scale=0.6 / 1.702, size=levels.size)
+        for setpoint, held in ((4.0, 0.9), (4.0, 0.55), (-3.0, 0.7)):
+            stays = rng.random(levels.size) < held
+            wanted = np.where(stays, setpoint, levels)
+            candidates = np.linspace(min(setpoint, 0.0), max(setpoint, 0.0), 81)
+            losses = [np.abs(wanted - target - noise).mean() for target in candidates]
+            best = candidates[np.argmin(losses)]
+            target = self.SETPOINT.targets(
+                np.array([setpoint]), np.array([held]), np.array([0.6])
+            )
+            assert target[0] == pytest.approx(best, abs=0.12)
+
+    def test_a_set_point_that_stays_is_not_hedged(self):
+        setpoints = np.array([5.0, -2.0, 0.0])
+        targets = self.SETPOINT.targets(setpoints, np.ones(3), np.full(3, 0.5))
+        np.testing.assert_array_equal(targets, setpoints)
 
 
 def test_numpy_and_pytorch_choose_the_same_flows(observations):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from agents.bank import Prior
 from agents.hedge import RandomSetpoint
-from agents.self_tuning import CLEARANCE, GAIN_SPREAD, TIME_CONSTANTS
+from agents.self_tuning import CLEARANCE, CONSTANT_SPREAD, GAIN_SPREAD, TIME_CONSTANTS
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
@@ -216,7 +216,9 @@ class Sampler:
         of_delay = -0.5 * (off / 4.0).square() * graded
         is_middle = torch.from_numpy(TIME_CONSTANTS == 1.0)
         excluded = exact & ~((off[:, None] == 0.0) & is_middle[:, None])
-        logarithms = of_delay[:, None] + torch.where(excluded, -200.0, 0.0)
+        of_constants = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
+        logarithms = of_delay[:, None] + torch.from_numpy(of_constants)[:, None]
+        logarithms = logarithms + torch.where(excluded, -200.0, 0.0)
         prior = Prior(
             time_constants=(torch.from_numpy(TIME_CONSTANTS)[:, None] * constants).numpy(),
             shortest_delays=shortest.numpy(),
