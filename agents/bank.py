@@ -1,4 +1,4 @@
-"""Identify plants by a bank of models while they are controlled.
+"""Identify the delays and time constants of plants by a bank of models.
 
 All quantities are scaled, so that one bank serves any plant: flows by half the actuator's
 range, temperatures by the steady effect of such a flow in the step test (the *authority*), and
@@ -41,12 +41,13 @@ LAGS: Final = 4  # latest residuals that are known
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of n plants before they are controlled."""
+    """The prior knowledge of n plants, before they are controlled."""
 
     time_constants: ArrayLike
-    """Time constants in the bank, samples, shape (time constants, n)."""
+    """Time constants of the models, samples, shape (time constants, n)."""
     shortest_delays: ArrayLike
-    """Shortest delay d of (28) in the bank, samples, shape (n,); the others follow it."""
+    """Shortest delay d of (28), samples, shape (n,). The models have this delay and the next
+    longer ones, a sample apart."""
     log_probabilities: ArrayLike
     """Logarithms of the models' probabilities, up to a constant, shape (delays, time
     constants, n)."""
@@ -56,7 +57,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a bank knows of n plants: means over its models and their standard deviations."""
+    """The estimates of a bank for n plants: means over its models, and standard deviations."""
 
     shares: Array
     """Probabilities of the time constants, shape (time constants, n)."""

@@ -147,7 +147,8 @@ class Controller(ABC):
     Parameters
     ----------
     u_min
-        Lower limit of the actuator, t/h. The limits scale the action, and do not clip commands.
+        Lower limit of the actuator, t/h. The limits are the flows for which the actions -1 and
+        1 stand. The controller does not clip commands beyond the limits.
     u_max
         Upper limit of the actuator, t/h.
 

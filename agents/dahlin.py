@@ -26,8 +26,8 @@ class DahlinController(InternalModelController):
 
     - A model of first order, x(k+1) = p x(k) + b u_a(k), runs beside the plant; x(k-d) is what
       the plant should show now.
-    - The disturbance is what it shows beyond that, through a filter:
-      D(k) = D(k-1) + f (y(k) - x(k-d) - D(k-1)).
+    - D is the estimated disturbance: the measured output less the output of the model, after a
+      low-pass filter: D(k) = D(k-1) + f (y(k) - x(k-d) - D(k-1)).
     - The command is the one that moves the model a share g of its way to y_d - D:
       u(k) = ((1 - p) x(k) + g (y_d(k) - D(k) - x(k))) / b.
 
@@ -40,9 +40,9 @@ class DahlinController(InternalModelController):
     Parameters
     ----------
     closed_loop_time_constant
-        lambda, time constant of the response to the set point, s. With a slow one the commands
-        for small errors stay inside the dead zone: an error of up to half of what the zone's
-        edge makes of the plant, times lambda over the time constant, is left alone.
+        lambda, time constant of the response to the set point, s. With a large lambda, the
+        commands for small errors stay inside the dead zone and have no effect. The controller
+        then does not correct errors up to 0.5 |gain| dead_zone lambda / time_constant, degC.
     filter_time_constant
         T_f, time constant of the filter of the disturbance, s. It sets the robustness of the
         loop without changing the response to the set point; 0 for no filter, as in 1968.

@@ -1,9 +1,11 @@
-"""Control plants by what a bank of models and a filter of the load predict.
+"""Choose flows by the predictions of a bank of models and of a filter.
 
-As in a Smith predictor, the response to past flows is known before the delay is over. What the
-models do not explain is forecast to the end of the delay. The flow is chosen such that the
-output approaches its target. The law is written once for NumPy, in which it runs, and PyTorch,
-in which a network that corrects it is trained. Quantities are scaled as in `agents.bank`.
+As in a Smith predictor, the models predict the response to flows that are in transit. The
+filter forecasts the part of the output that the models do not explain. The flow moves the
+predicted output towards its target.
+
+The control law is written once for two libraries: it runs in NumPy, and in PyTorch a network
+that corrects it is trained. Quantities are scaled as in `agents.bank`.
 """
 
 from __future__ import annotations
@@ -41,25 +43,26 @@ Network = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class Situation:
-    """What n loops have seen so far, by which they choose their flows."""
+    """The knowledge of n loops at a sample, by which they choose their flows."""
 
     targets: Array
-    """Outputs that the flows are to bring about, less the forecast residuals, shape (n,)."""
+    """Wanted outputs of the models when the next flows show: the set point, hedged, less the
+    forecast residual, shape (n,)."""
     estimate: Estimate
     gain: Array
     """Gain, as a multiple of the step test's, shape (n,)."""
     gain_spread: Array
     """Standard deviation of the gain, shape (n,)."""
     noise: Array
-    """Standard deviation of one-step errors and `DOUBT`, of the authority, shape (n,)."""
+    """Standard deviation of one-step errors, plus `DOUBT`, of the authority, shape (n,)."""
     inputs: Array
-    """What a network sees of the past, shape (n, PAST_INPUTS)."""
+    """Inputs of a network that do not depend on the present flow, shape (n, PAST_INPUTS)."""
 
 
 class Observer:
-    """The memory of the law: bank of models, filter of the load, and age of the set point.
+    """The memory of n loops: the bank of models, the filter, and the age of the set point.
 
-    Nothing in it has a gradient.
+    The observer is NumPy alone, so no gradient passes through it.
 
     Parameters
     ----------
@@ -70,8 +73,8 @@ class Observer:
     limits
         Lowest and highest flow, each of shape (n,).
     setpoint
-        How set points change at random, with amplitudes as shares of the authority; None if
-        they do not change, or if nothing is known of their changes.
+        The distribution of random set points, with amplitudes as shares of the authority; None
+        if nothing is known about changes of the set points.
     """
 
     def __init__(
@@ -91,7 +94,10 @@ class Observer:
         self._k = 0
 
     def observe(self, setpoint: Array, output: Array) -> Situation:
-        """Take set points and outputs of a sample, shape (n,), and return the situation."""
+        """Take the set points and outputs of a sample, of the authority, shape (n,).
+
+        The situation that is returned includes them.
+        """
         bank = self.bank
         bank.observe(output)
         estimate = bank.estimate
@@ -117,7 +123,10 @@ class Observer:
     def _inputs(
         self, output: Array, aim: Array, held: Array, forecast: Array, noise: Array
     ) -> Array:
-        """Return what a network sees of the past, shape (n, PAST_INPUTS)."""
+        """Return the inputs of a network from the past, shape (n, PAST_INPUTS).
+
+        `aim` is the hedged set point, and `held` the probability that the set point stays.
+        """
         bank, estimate = self.bank, self.bank.estimate
         setpoint = self._setpoint
         assert setpoint is not None
@@ -158,11 +167,16 @@ def _limited(signals: Array) -> Array:
 
 
 class Law:
-    """The law of n loops: from what they have seen, and a network's corrections, to flows.
+    """The control law of n loops: from a situation to flows.
 
-    The flow holds the mean model's output at the target, and moves it there by a share a
-    sample. A network corrects the target, in units of the noise; the target, as far as the gain
-    is uncertain; and the share.
+    With the mean model's output m, its gain g and its pole p, and the target r, the flow is
+
+        f = (r + share (r - m) / (1 - p)) / g,
+
+    moved out of the dead zone and limited. The first term holds m at r, and the second closes a
+    share of the gap in one sample. A network, if there is one, has three outputs: an addition
+    to r in units of the noise, a relative change of r in units of the gain's standard
+    deviation, and half the logit of the share.
 
     Parameters
     ----------
@@ -196,9 +210,10 @@ class Law:
         self._flow = convert(np.zeros(bank.n, np.float32))
 
     def flow(self, situation: Situation, network: Network | None = None) -> Any:
-        """Return the flows, shape (n,), which pass the dead zone or are 0.
+        """Return the flows of half the actuator's range, shape (n,).
 
-        Without a network, the law is linear but for the dead zone and the limits.
+        Each flow is 0 or passes the dead zone. Without a network, the control law is linear
+        apart from the dead zone and the limits.
         """
         convert = self._convert
         estimate = situation.estimate
@@ -218,7 +233,7 @@ class Law:
         return self._passing((target + share / rate * (target - model)) / gain)
 
     def _inputs(self, situation: Situation, model: Any, slope: Any) -> Any:
-        """Return what a network sees, shape (n, INPUTS)."""
+        """Return the inputs of a network, shape (n, INPUTS)."""
         xp = self._xp
         gap = self._convert(situation.targets) - model
         noise = self._convert(situation.noise)

@@ -34,17 +34,22 @@ SLOWEST: Final = 45.0  # samples, the greatest time constant that needs no slowe
 class SelfTuningController(ModelBasedController):
     """A predictive controller that identifies the plant while it controls it.
 
-    A bank of models with different delays and time constants runs in parallel with the plant.
-    Each model estimates its gain, and is weighted by how well it predicts (D. T. Magill,
-    "Optimal adaptive estimation of sampled stochastic processes", IEEE Transactions on
-    Automatic Control 10, 1965, 434-439); see `agents.bank.Bank`. As in a Smith predictor, the
-    mean model tells the response to past flows before it shows. What it does not explain is
-    taken for a load and forecast; see `agents.law.Law`.
+    The controller has four parts:
+
+    - A bank of models with different delays and time constants runs in parallel with the plant.
+      Each model is weighted by how well it predicts (D. T. Magill, "Optimal adaptive estimation
+      of sampled stochastic processes", IEEE Transactions on Automatic Control 10, 1965,
+      434-439). See `agents.bank`.
+    - Kalman filters estimate the gain of the plant and the load. See `agents.output_filter`.
+    - If the set point is known to change at random, the target falls short of a set point that
+      may change before a flow shows. See `agents.hedge`.
+    - As in a Smith predictor, the mean model predicts the response to flows in transit, and the
+      flow moves the predicted output to the target. See `agents.law`.
 
     A command is 0 or outside the dead zone, so the models know the flow that passes. All
     quantities are scaled, so the controller serves plants of either sign, with any limits and
-    any sampling interval. With a time constant of 90 samples and more, it acts at every second
-    sample or less often.
+    any sampling interval. If the time constant is 90 samples or more, the controller acts at
+    every second sample or less often.
 
     The other parameters are those of `ModelBasedController`.
 
@@ -54,16 +59,16 @@ class SelfTuningController(ModelBasedController):
         The greatest half width that the dead zone may have, t/h.
     delay_range
         Shortest and longest delay that the plant may have, s, including the one sample that any
-        input takes to show; they are then equally likely. By default the delay is from a third
-        to twice that of the step test, and the more likely the nearer.
+        input takes to show. All delays in this range are equally likely. By default, the delay
+        is between a third and twice the delay of the step test, and a delay near that of the
+        step test is more likely.
     setpoint_holds
-        Shortest and longest time, s, for which a random level of the set point is held, if its
-        levels are known to be random; each time between them is equally likely. The target then
-        falls short of a set point that may change before a flow shows. By default, nothing is
-        known of changes of the set point.
+        Shortest and longest time, s, for which the set point keeps a random level. All times in
+        this range are equally likely. By default, nothing is known about changes of the set
+        point.
     setpoint_amplitude
-        Greatest level of a random set point, degC. The levels are uniform between its negative
-        and this.
+        Greatest level of a random set point, degC. The levels are uniformly distributed between
+        `-setpoint_amplitude` and `setpoint_amplitude`. It needs `setpoint_holds`.
     setpoint_index, error_index
         Indices of y_d(k) and e(k), degC, in the observation.
     """
@@ -124,7 +129,7 @@ class SelfTuningController(ModelBasedController):
         }
 
     def reset(self) -> None:
-        """Forget the episode and what was learnt: the next plant may be different."""
+        """Forget the episode and the identified plant, as the next plant may be different."""
         super().reset()
         self._k = 0
 
@@ -177,7 +182,7 @@ class SelfTuningController(ModelBasedController):
         return RandomSetpoint(shortest, longest, self.setpoint_amplitude / abs(self._authority))
 
     def _network(self) -> Network | None:
-        """Return what corrects the law: nothing, so it is linear."""
+        """Return the network that corrects the control law; None, as there is none."""
         return None
 
 
@@ -197,11 +202,11 @@ def _check_range(name: str, limits: Any) -> tuple[float, float]:
 
 @dataclass(eq=False, kw_only=True)
 class NeuralSelfTuningController(SelfTuningController):
-    """A self-tuning controller whose law is corrected by a trained recurrent network.
+    """A self-tuning controller whose control law is corrected by a trained recurrent network.
 
-    The network was trained once, on many plants, and does not learn online. It is run in
-    float32: a loop in a batch can differ from a single one by rounding. The parameters are
-    those of `SelfTuningController` and the following.
+    The network was trained once, on many simulated plants, and does not learn online. The
+    network is computed in float32, so a loop in a batch can differ from a single loop by
+    rounding. The parameters are those of `SelfTuningController` and the following.
 
     Parameters
     ----------
@@ -216,7 +221,7 @@ class NeuralSelfTuningController(SelfTuningController):
         self._state = self.network.initial_state(n)
 
     def _network(self) -> Network:
-        """Return the network with its state, as a function of inputs."""
+        """Return the network as a function of its inputs, which keeps its state."""
         return self._outputs
 
     def _outputs(self, inputs: Array) -> Array:
@@ -227,9 +232,10 @@ class NeuralSelfTuningController(SelfTuningController):
 
 @dataclass(eq=False, kw_only=True)
 class NeuralSmithPredictor(NeuralSelfTuningController):
-    """The same network and law with a single model, that of a step test.
+    """A neural controller that trusts a step test, in place of identifying the plant.
 
-    The parameters are those of `NeuralSelfTuningController`; `delay_range` does not apply.
+    It is a `NeuralSelfTuningController` with a single model, that of the step test, and a known
+    gain. It has the same parameters, except `delay_range`.
     """
 
     delay_range: None = field(init=False, default=None)

@@ -25,12 +25,14 @@ class SmithPredictor(InternalModelController):
     no delay (O. J. M. Smith, "Closer control of loops with dead time", Chemical Engineering
     Progress 53, 1957, 217-219).
 
-    The gains `kp` and `ki` are SIMC's for the plant without delay. The model is driven by the
-    flow that the actuator passes. A command inside the dead zone is moved to 0 or to the edge
-    of the zone, whichever is nearer. Against windup, the integral follows the wanted flow as
-    far as the limits pass it, with the time constant of the integral action; between the
-    limits, this is the same PI controller (K. J. Astrom and T. Hagglund, "PID Controllers", 2nd
-    edition, 1995, section 3.5). Inside the dead zone it goes on, until the flow passes.
+    The gains `kp` and `ki` follow from the SIMC rule for the plant without delay. The input of
+    the model is the flow that the actuator passes. A command inside the dead zone is moved to 0
+    or to the edge of the dead zone, whichever is nearer.
+
+    To prevent windup, the integral follows the wanted flow, limited to the actuator's range,
+    with the time constant of the integral action (K. J. Astrom and T. Hagglund, "PID
+    Controllers", 2nd edition, 1995, section 3.5). As long as no limit is active, this is the
+    usual PI controller. While the wanted flow is inside the dead zone, the integral goes on.
 
     The other parameters are those of `ModelBasedController`.
 
