@@ -106,6 +106,9 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         self._actuator, self._flow = Actuator(numbers, *self.increments), 0.0
         return observation, info
 
+    def __str__(self) -> str:
+        return f"<{type(self).__name__}{self.increments}{self.env}>"
+
     def action(self, action: Any) -> NDArray[np.float32]:
         """Move the wanted flow by an action, shape (1,), and return the absolute action."""
         move, actuator = one_action(action), self._actuator

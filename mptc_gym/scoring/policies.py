@@ -1,0 +1,166 @@
+"""Call a policy in any of its four forms as a function of observations.
+
+A policy is an object with `predict`, as in Stable-Baselines3; an object with `act`; a
+`torch.nn.Module`; or a function of NumPy arrays. A bound `predict` or `act` stands for its
+object, and a `functools.partial` for its function.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mptc_gym.checks import reject
+from mptc_gym.layers import is_environment, loaded
+
+# Takes observations, one row for each plant, and returns actions, one row for each plant.
+Act = Callable[[Any], Any]
+# Methods that make an object a policy. The first one that an object has is called.
+_METHODS: Final = ("predict", "act")
+# Held while a module is called, as several threads may call it and change its mode.
+_LOCK: Final = threading.RLock()
+
+
+class Form(NamedTuple):
+    """How a policy is called."""
+
+    function: Callable[..., Any]  # what is called with observations
+    method: str  # "predict", "act", or "" if the policy itself is the function
+    target: Any  # the object that the policy is, or whose `predict` or `act` it is
+    module: Any  # the torch.nn.Module that the policy is or whose method it is, or None
+
+
+def form_of(policy: Any) -> Form:
+    """Return how a policy is called; ValueError if it has none of the four forms."""
+    if is_environment(policy):
+        reject("policy", policy, "a policy, which comes first: evaluate(policy, env)")
+    if isinstance(policy, type):
+        reject("policy", policy, "an object with predict or act, not a class")
+    target = policy
+    while isinstance(target, partial):
+        target = target.func
+    owner = getattr(target, "__self__", target)  # the object of a bound method
+    module = owner if isinstance(owner, loaded("torch.nn.Module")) else None
+    for method in _METHODS:
+        if callable(getattr(policy, method, None)):
+            return Form(getattr(policy, method), method, policy, module)
+    method = getattr(target, "__name__", "")
+    if method in _METHODS and owner is not target:
+        return Form(policy, method, owner, module)
+    if not callable(policy):
+        allowed = "a function, a torch.nn.Module, or an object with predict or act"
+        reject("policy", policy, allowed)
+    return Form(policy, "", target, module)
+
+
+def start(policy: Any, n: int) -> Act:
+    """Reset a policy for n episodes, and return its function of observations.
+
+    `reset()` is called on the object that the policy is, or whose `predict` or `act` it is, if
+    the object has this method. It is not called on the owner of another method. A ValueError is
+    raised if the policy has none of the four forms.
+    """
+    form = form_of(policy)
+    reset = getattr(form.target, "reset", None)
+    if callable(reset):
+        reset()
+    act = _predicting(form.function, n) if form.method == "predict" else form.function
+    if form.module is None:
+        return act
+    if not form.method:
+        act = _taking_tensors(act, form.module)
+    return _in_evaluation_mode(act, form.module)
+
+
+def _predicting(predict: Callable[..., Any], n: int) -> Act:
+    """Return a `predict` in the form of Stable-Baselines3 as a function of observations.
+
+    The function is for one round of n episodes. It passes `state`, `episode_start` and
+    `deterministic=True`, except those that `predict` does not take or that a
+    `functools.partial` has set.
+    """
+    parameters = inspect.signature(predict).parameters
+    takes_all = any(item.kind is item.VAR_KEYWORD for item in parameters.values())
+    settled = predict.keywords if isinstance(predict, partial) else {}
+    keywords = {"state": None, "episode_start": np.ones(n, np.bool_), "deterministic": True}
+    for name in [*keywords]:
+        if name in settled or not (takes_all or name in parameters):
+            del keywords[name]
+
+    def act(observations: Any) -> Any:
+        returned = predict(observations, **keywords)
+        if "episode_start" in keywords:
+            keywords["episode_start"] = np.zeros(n, np.bool_)
+        if not isinstance(returned, tuple):
+            return returned
+        actions, state = returned
+        if "state" in keywords:
+            keywords["state"] = state
+        return actions
+
+    return act
+
+
+def _taking_tensors(act: Act, module: Any) -> Act:
+    """Return the function of NumPy arrays that calls a module, or its method, with tensors.
+
+    Tensors have the type and the device of the module's weights. If the module has no weights,
+    tensors are of float32 on the CPU.
+    """
+    torch: Any = sys.modules["torch"]  # as this package does not depend on PyTorch
+    weights = next(module.parameters(), torch.empty(0))
+
+    def in_tensors(observations: Any) -> Any:
+        if isinstance(observations, Mapping):
+            return {name: in_tensors(part) for name, part in observations.items()}
+        if isinstance(observations, tuple):
+            return tuple(map(in_tensors, observations))
+        return torch.tensor(observations).to(weights)
+
+    return lambda observations: act(in_tensors(observations))
+
+
+def _in_evaluation_mode(act: Act, module: Any) -> Act:
+    """Return a function that calls a module, or its method, as a policy is called.
+
+    During a call, the module is in evaluation mode, and computes no gradients. The flags of all
+    its parts are put back after each call. Actions in a tensor are returned as an array.
+    """
+    torch: Any = sys.modules["torch"]
+
+    def evaluating(observations: Any) -> Any:
+        with _LOCK, torch.no_grad():
+            # The parts of a frozen script have no flag.
+            parts = [part for part in module.modules() if hasattr(part, "training")]
+            flags = {part: part.training for part in parts}
+            _set_mode(module, False)
+            try:
+                actions = act(observations)
+            finally:
+                if module in flags:
+                    _set_mode(module, flags[module])  # for what its own `train` sets
+                for part, flag in flags.items():
+                    part.training = flag
+        if isinstance(actions, torch.Tensor):  # of any type, on any device
+            return np.array(actions.tolist())
+        return actions
+
+    return evaluating
+
+
+def _set_mode(module: Any, training: bool) -> None:
+    """Set the mode of a module and of its parts, by its own `train(mode=True)` if it has one.
+
+    Some modules have a method `train` that is a training, and that is not called here.
+    """
+    parameters = inspect.signature(module.train).parameters.values()
+    if next((parameter.default for parameter in parameters), None) is True:
+        module.train(training)
+    else:
+        sys.modules["torch"].nn.Module.train(module, training)
