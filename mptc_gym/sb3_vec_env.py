@@ -49,15 +49,16 @@ class GymnasiumVecEnv(VecEnv):
         modes = {batch.metadata.get("autoreset_mode") for batch in batches}
         if modes != {AutoresetMode.SAME_STEP}:
             raise ValueError(f"batches must have autoreset_mode 'SameStep', got {modes}")
-        self.batches = batches
+        self.batches: tuple[Any, ...] = batches
         self.spec = spec
         self.group = group
         self.infos: dict[str, Any] = {}
-        self._places: list[_Place] = []  # of all environments
+        self._slices: list[slice] = []  # the numbers of the environments of each batch
+        self._places: list[_Place] = []  # of each environment
         for number, batch in enumerate(batches):
+            first = len(self._places)
+            self._slices.append(slice(first, first + batch.num_envs))
             self._places += [_Place(number, row) for row in range(batch.num_envs)]
-        sizes = [batch.num_envs for batch in batches]
-        self._edges = np.cumsum(sizes)[:-1]  # numbers of the first environments of batches
         num_envs = len(self._places)
         self._next_seeds: list[int | None] = [None] * num_envs
         self._returns = np.zeros(num_envs)  # of the episode so far
@@ -79,14 +80,13 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> NDArray[Any]:
         """Reset all environments, with the seeds set by `seed` or `set_seeds`."""
-        seeds = np.split(np.array(self._next_seeds, object), self._edges)
+        returned = [
+            batch.reset(seed=self._next_seeds[numbers])
+            for batch, numbers in zip(self.batches, self._slices, strict=True)
+        ]
         self._next_seeds = [None] * self.num_envs
         self._returns[:] = 0.0
         self._lengths[:] = 0
-        returned = [
-            batch.reset(seed=seeds_of_batch.tolist())
-            for batch, seeds_of_batch in zip(self.batches, seeds, strict=True)
-        ]
         observations, infos = zip(*returned, strict=True)
         self.infos = _joined(infos)
         self.reset_infos = [
@@ -100,10 +100,9 @@ class GymnasiumVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step with the stored actions."""
-        actions = np.split(self._actions, self._edges)
         returned = [
-            batch.step(actions_of_batch)
-            for batch, actions_of_batch in zip(self.batches, actions, strict=True)
+            batch.step(self._actions[numbers])
+            for batch, numbers in zip(self.batches, self._slices, strict=True)
         ]
         *arrays, batch_infos = zip(*returned, strict=True)
         observations, rewards, terminated, truncated = map(np.concatenate, arrays)
@@ -132,7 +131,7 @@ class GymnasiumVecEnv(VecEnv):
         """Return a picture of each environment, if the batches render."""
         images: list[NDArray[np.uint8]] = []
         for batch in self.batches:
-            images += cast("Any", batch.render() or ())
+            images += batch.render() or ()
         return images
 
     def close(self) -> None:

@@ -759,6 +759,13 @@ class TestWhatCannotBeCopied:
                 env.step(np.zeros(1, np.float32))
             assert not {*seeds} & {*range(SEED, SEED + 9)}
 
+    def test_a_model_of_other_processes_may_act_in_this_one(self):
+        with closing(processes(lambda: moved(made()))) as training:
+            model = model_of(PPO, training)
+            found = evaluate(model, lambda: moved(made()), episodes=EPISODES)
+        expected = errors_of(predicting(model), lambda: moved(made()))
+        np.testing.assert_allclose(found.errors, expected, rtol=0, atol=1e-6)
+
     def test_it_is_refused_without_harm_where_a_model_trains_in_it(self):
         model = model_of(PPO, VecNormalize(processes()))
         with closing(model.get_env()):

@@ -133,34 +133,27 @@ def _in_evaluation_mode(act: Act, module: Any) -> Act:
     its parts are put back after each call. Actions in a tensor are returned as an array.
     """
     torch: Any = sys.modules["torch"]
+    parts = [part for part in module.modules() if hasattr(part, "training")]
+    set_mode = module.train
+    arguments = inspect.signature(set_mode).parameters.values()
+    if next((argument.default for argument in arguments), None) is not True:
+        # This `train` is a training, where that of PyTorch is `train(mode=True)`.
+        set_mode = partial(torch.nn.Module.train, module)
 
     def evaluating(observations: Any) -> Any:
         with _LOCK, torch.no_grad():
-            # The parts of a frozen script have no flag.
-            parts = [part for part in module.modules() if hasattr(part, "training")]
-            flags = {part: part.training for part in parts}
-            _set_mode(module, False)
+            is_training = getattr(module, "training", False)  # a frozen script has no flag
+            flags = [part.training for part in parts]
+            set_mode(False)
             try:
                 actions = act(observations)
             finally:
-                if module in flags:
-                    _set_mode(module, flags[module])  # for what its own `train` sets
-                for part, flag in flags.items():
-                    part.training = flag
+                set_mode(is_training)  # for other attributes that a `train` may set
+                for part, flag in zip(parts, flags, strict=True):
+                    if part.training != flag:  # as PyTorch takes long to set an attribute
+                        part.training = flag
         if isinstance(actions, torch.Tensor):  # of any type, on any device
             return np.array(actions.tolist())
         return actions
 
     return evaluating
-
-
-def _set_mode(module: Any, training: bool) -> None:
-    """Set the mode of a module and of its parts, by its own `train(mode=True)` if it has one.
-
-    Some modules have a method `train` that is a training, and that is not called here.
-    """
-    parameters = inspect.signature(module.train).parameters.values()
-    if next((parameter.default for parameter in parameters), None) is True:
-        module.train(training)
-    else:
-        sys.modules["torch"].nn.Module.train(module, training)
