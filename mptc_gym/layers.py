@@ -35,7 +35,8 @@ class PlantGroup(NamedTuple):
     parameters: Parameters
     num_envs: int
     name: str  # id of the environment, or the name of its class if it has no id
-    wrappers: tuple[str, ...]  # which change observations or actions, outermost first
+    # The classes of the wrappers that change observations or actions, outermost first.
+    wrappers: tuple[str, ...]
 
 
 def loaded(name: str) -> Any:
@@ -103,7 +104,8 @@ def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
     """
     wrappers = outer
     if _changes_policy(env):
-        wrappers = (*outer, _wrapper_name(env))
+        increments = vars(env).get("increments", "")  # the arguments of an IncrementalAction
+        wrappers = (*outer, f"{type(env).__name__}{increments}")
     if isinstance(env, MiddlePointEnv | MiddlePointVectorEnv):
         name = env.spec.id if env.spec else type(env).__name__
         return [PlantGroup(env.parameters, getattr(env, "num_envs", 1), name, wrappers)]
@@ -124,12 +126,6 @@ def _changes_policy(layer: Any) -> bool:
         return False
     wrappers = gymnasium.Wrapper, gymnasium.vector.VectorWrapper
     return isinstance(layer, (*wrappers, loaded(f"{VEC_ENV}.VecEnvWrapper")))
-
-
-def _wrapper_name(layer: Any) -> str:
-    """Return the name of a wrapper's class; of an `IncrementalAction` with its arguments."""
-    increments = vars(layer).get("increments", "")
-    return f"{type(layer).__name__}{increments}"
 
 
 def ask_processes(env: Any, method: str, *arguments: Any) -> list[Any]:
@@ -153,8 +149,8 @@ def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
         return []
     groups = []
     for text, plant_parameters in zip(texts, parameters, strict=True):
-        # Such as "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>", or, without an id,
-        # "<TimeLimit<MiddlePointEnv instance>>".
+        # A text is such as "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>", or, if the environment
+        # has no id, "<TimeLimit<MiddlePointEnv instance>>".
         *classes, last = text.strip("<>").split("<")
         wrappers = tuple(name for name in classes if name not in _NEUTRAL)
         if isinstance(plant_parameters, Parameters):

@@ -14,6 +14,7 @@ import dataclasses
 import json
 import pkgutil
 import tempfile
+import uuid
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -229,7 +230,7 @@ class ScoreCallback(BaseCallback):
             if self.path.exists() and not self._has_saved:
                 allowed = "a file that does not exist yet, as it would be overwritten"
                 reject("path", str(self.path), allowed)
-            trial = self.path.with_name(f".{self.path.name}.trial")
+            trial = self.path.with_name(f".{uuid.uuid4().hex}.zip")
             save(self.model, trial)
             trial.unlink()
         env, arguments = self._environment()

@@ -502,10 +502,10 @@ REFUSED = {
             *(found := env.step(action))[:2], found[4]["error"] > 6.5, *found[3:]))),
         "all episodes at once"),
     "VecNormalize without statistics": (
-        lambda: (law, VecNormalize(dummy())), "in VecNormalize, which has seen nothing"),
+        lambda: (law, VecNormalize(dummy())), "in VecNormalize, got initial"),
     "new NormalizeObservation": (
         lambda: (law, wrappers.NormalizeObservation(made())),
-        "NormalizeObservation, which has seen noth"),
+        "in NormalizeObservation, got initial"),
     "normalised in one of the processes": (
         lambda: (law, AsyncVectorEnv(
             [made, lambda: wrappers.NormalizeReward(made())], context="fork")),

@@ -291,7 +291,7 @@ class TestScoreCallback:
     def test_it_refuses_what_it_cannot_judge(self, tmp_path):
         with pytest.raises(ValueError, match="every must be an integer from 1"):
             ScoreCallback(every=0)
-        with pytest.raises(ValueError, match=r"best.zip.* cannot be written: No such file"):
+        with pytest.raises(ValueError, match="zip cannot be written: No such file"):
             model_of(make_vec_env()).learn(64, ScoreCallback(path=tmp_path / "none" / "best"))
         model = model_of(VecNormalize(make_vec_env()))
         for env, message in (

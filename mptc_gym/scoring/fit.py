@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import Any, Final
 
 from gymnasium.spaces import Box
@@ -28,10 +28,11 @@ _MODELS: Final = (
 def check_fit(policy: Any, plants: Plants) -> None:
     """Raise a ValueError if a policy cannot be scored in these plants.
 
-    Wrappers that normalise must have statistics, and must not run in other processes. A policy
-    with a method `check_environment`, as those in `agents`, judges for itself. A model of
-    Stable-Baselines3 must have the spaces of its training and, as long as it has the
-    environments of its training, their windows and wrappers.
+    Wrappers that normalise must have the statistics of a training, and must not run in other
+    processes. A policy with a method `check_environment`, such as a controller in `agents`,
+    checks the plants itself. For a model of Stable-Baselines3, the plants must have the spaces
+    of its training and, as long as the model has the environments of its training, the windows
+    and wrappers of these environments.
     """
     for layer in layers(plants):
         if runs_processes(layer):
@@ -69,8 +70,8 @@ def _check_processes(layer: Any) -> None:
     """Raise a ValueError if a wrapper of Gymnasium normalises in other processes."""
     if any(ask_processes(layer, "has_wrapper_attr", "update_running_mean")):
         raise ValueError(
-            "env must not normalise in other processes, where its statistics cannot be frozen: "
-            "use DummyVecEnv or SyncVectorEnv"
+            "env must not normalise in other processes, where statistics cannot be kept from "
+            "changing: use DummyVecEnv or SyncVectorEnv"
         )
 
 
@@ -81,12 +82,12 @@ def _check_statistics(layer: Any) -> None:
     for part in parts:
         if not part.mean.any() and (part.var == 1.0).all():
             raise ValueError(
-                f"env must have the statistics of the training in {type(layer).__name__}, "
-                "which has seen nothing: load or copy them"
+                f"env must have the statistics of the training in {type(layer).__name__}, got "
+                "initial statistics: load or copy the statistics of the training"
             )
 
 
-def _compare(what: str, of_training: Iterable[Any], of_env: Iterable[Any]) -> None:
+def _compare(what: str, of_training: Collection[Any], of_env: Collection[Any]) -> None:
     """Raise a ValueError if environments differ from those of a model's training.
 
     `of_training` and `of_env` are collections of the same type: of windows, of wrappers, or of

@@ -19,15 +19,15 @@ from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.policies import form_of
 from mptc_gym.scoring.rollout import in_columns
 
-# A vector environment of Gymnasium; its annotations do not allow a list of seeds.
+# A vector environment of Gymnasium. `VectorEnv` as its type does not allow a list of seeds.
 Plants = Any
 
 
 @contextmanager
 def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plants]:
-    """Yield the vector environment that a policy acts in.
+    """Open a vector environment for a policy to act in.
 
-    In the meantime, wrappers that normalise do not update their statistics.
+    While it is open, wrappers that normalise do not update their statistics.
 
     Parameters
     ----------
@@ -42,6 +42,11 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
     **arguments
         Further arguments for an id or a spec, as in `gymnasium.make`.
 
+    Yields
+    ------
+    VectorEnv
+        A vector environment of Gymnasium, whose plants are those of `env`.
+
     Raises
     ------
     ValueError
@@ -51,7 +56,7 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
     target = form_of(policy).target
     if arguments and not isinstance(env, str | EnvSpec):
         raise ValueError(f"{', '.join(arguments)} must be given where env is made")
-    with ExitStack() as stack:
+    with ExitStack() as stack:  # which undoes all in the reverse order
         if is_environment(env):
             copy = Copy(env)
             _refuse_training_environments(copy, getattr(target, "env", None))
@@ -64,7 +69,7 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
         if not plant_groups(plants):
             allowed = "of MiddlePointEnv in NumPy, and open, such as an id or a spec of it"
             reject("env", env, allowed)
-        if acts_itself:
+        if acts_itself:  # within the copies of wrappers that can be copied
             stack.enter_context(_frozen(env))
             stack.callback(_as_vector(env).reset, seed=_next_seeds(plants))
         stack.enter_context(_frozen(plants))
@@ -72,7 +77,7 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
 
 
 def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
-    """Return n plants of an id or a spec, or from n calls of a function."""
+    """Make n plants from an id or a spec, or by n calls of a function."""
     if isinstance(env, str | EnvSpec):
         single = make_one(env, arguments)
         batch = make_batch(single, n)
@@ -114,7 +119,7 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
         self.num_envs = venv.num_envs
         self.single_observation_space = venv.observation_space
         self.single_action_space = venv.action_space
-        self.closed = True  # a user closes it
+        self.closed = True  # as only the user closes environments that are handed over
 
     @property
     def np_random_seed(self) -> Any:
@@ -158,8 +163,8 @@ def _refuse_training_environments(copy: Copy, training: Any) -> None:
 def _next_seeds(plants: Plants) -> list[int]:
     """Return seeds of new episodes, which follow from the seeds of the present episodes.
 
-    So the user's environments do not go on with the episodes of a score, and what happens in
-    these environments can be repeated.
+    With these seeds, the environments of a user do not go on with the episodes of a score, and
+    a user who seeds the environments can repeat a program.
     """
     present = np.ravel(plants.unwrapped.np_random_seed).tolist()
     # Gymnasium has a negative number for a seed that it does not know.
