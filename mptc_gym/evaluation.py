@@ -107,21 +107,21 @@ def evaluate(
     """Run a policy on fixed episodes and score it.
 
     As with `evaluate_policy` of Stable-Baselines3, the policy acts in exactly the environments
-    that are handed over: their windows, wrappers and statistics must be those of its training.
-    The policy acts in a copy, so that these environments do not change. A training may
-    therefore score its model in its own environments.
+    that are handed over: the windows, wrappers and statistics of these environments must be
+    those of the policy's training. The policy acts in a copy, so that the environments do not
+    change. A training may therefore score its model in the environments of the training.
 
     Parameters
     ----------
     policy
         A policy has one of four forms:
 
-        - an object with `predict`, as a model of Stable-Baselines3; `predict` receives `state`,
-          `episode_start` and `deterministic=True`, if it takes these arguments;
-        - an object with `act`, as the controllers in `agents`; `act` takes observations and
+        - an object with `predict`, such as a model of Stable-Baselines3; `predict` receives
+          `state`, `episode_start` and `deterministic=True`, if it takes these arguments;
+        - an object with `act`, such as a controller in `agents`; `act` takes observations and
           returns actions in NumPy arrays;
-        - a `torch.nn.Module`, or a method of a module; it receives a tensor, of float32 unless
-          its weights are of another type, is in evaluation mode, and computes no gradients;
+        - a `torch.nn.Module`, or a method of a module; it receives a tensor of the type of the
+          module's weights; the module is in evaluation mode, and computes no gradients;
         - any other function of observations, shape (n, size), that returns actions, shape
           (n, 1), in NumPy arrays.
 
@@ -131,20 +131,20 @@ def evaluate(
     env
         An id, such as one of `IDS`, or an `EnvSpec`; a function that makes one environment in
         each call; or environments: a single environment, a vector environment of Gymnasium, or
-        a `VecEnv` of Stable-Baselines3, such as `model.get_env()`. Environments that are fewer
-        than `episodes` run several rounds.
+        a `VecEnv` of Stable-Baselines3, such as `model.get_env()`. If there are fewer
+        environments than `episodes`, the environments run several rounds.
 
         Environments in other processes, in a window, or with anything else that cannot be
         copied act themselves, and begin a new episode afterwards. A ValueError is raised if the
-        policy is a model that trains in such environments. A copy shares the files that it
-        opens by name, global random streams, and variables that its functions refer to.
+        policy is a model that trains in such environments. Original and copy share files that
+        they open by name, global random streams, and variables to which functions refer.
     episodes
         Number of episodes, at least 2. An episode has 1,200 samples, or fewer if its
         environment ends it earlier.
     seed
         Seed of the first episode; the next episode has the next seed. The default is the seed
-        of all published scores. To choose among policies, use `seed=VALIDATION_SEED`, of
-        `mptc_gym.evaluation`, with at most 200 episodes, which no published score uses.
+        of all published scores. To choose among policies, import `VALIDATION_SEED` from
+        `mptc_gym.evaluation`: no published score uses the 200 episodes from this seed on.
     **arguments
         Further arguments for an id or a spec, as in `gymnasium.make`.
 
@@ -157,9 +157,9 @@ def evaluate(
     ------
     ValueError
         If the environment does not exist, is not of this package or runs other episodes than
-        those of its seeds; or if the policy or its actions do not fit the environment. A model
-        of Stable-Baselines3 that still has the environments of its training is compared with
-        them: windows, and wrappers by name.
+        those of its seeds; or if the policy or its actions do not fit the environment. If a
+        model of Stable-Baselines3 still has the environments of its training, `env` must have
+        the same windows, and wrappers of the same names.
 
     Examples
     --------
@@ -222,7 +222,7 @@ def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _
     for first in seeds[::n]:
         seeds_of_round = [*range(first, first + n)]
         samples = rollout(plants, start(policy, n), SAMPLES, seeds_of_round)
-        if type(plants) is not MiddlePointVectorEnv:
+        if type(plants) is not MiddlePointVectorEnv:  # wrappers may change the episodes
             samples = replayed(samples, parameters, seeds_of_round)
         rounds.append(_measure(samples, n))
         if rounds[-1].samples != rounds[0].samples:
