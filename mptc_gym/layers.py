@@ -149,8 +149,8 @@ def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
         return []
     groups = []
     for text, plant_parameters in zip(texts, parameters, strict=True):
-        # A text is such as "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>". If the environment has
-        # no id, the text is such as "<TimeLimit<MiddlePointEnv instance>>".
+        # An example of a text is "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>". For an
+        # environment without an id, it is "<TimeLimit<MiddlePointEnv instance>>".
         *classes, last = text.strip("<>").split("<")
         wrappers = tuple(name for name in classes if name not in _NEUTRAL)
         if isinstance(plant_parameters, Parameters):

@@ -23,14 +23,24 @@ _RECORDERS: Final = (
     "minari.DataCollector",
     f"{VEC_ENV}.VecVideoRecorder",
 )
+# The ends of pipes; on Windows, some are of a class that other systems do not have.
+_PIPES: Final[tuple[Any, ...]] = (
+    connection.Connection,
+    getattr(connection, "PipeConnection", connection.Connection),
+)
 
 
 class Copy:
     """A copy of an environment and of all that it wraps, also in mid-episode.
 
     The original stays as it is. The copy writes to no file of the original, and closes nothing.
-    The copy shares layers that run in other processes, show a window, hold a pipe, or cannot
-    be copied for another reason.
+    The copy shares layers with the original that run in other processes, show a window, hold a
+    pipe, or cannot be copied for another reason.
+
+    Parameters
+    ----------
+    env
+        An environment of any kind.
 
     Attributes
     ----------
@@ -43,7 +53,8 @@ class Copy:
     """
 
     def __init__(self, env: Any) -> None:
-        copyreg.pickle(connection.Connection, _refuse_pipe)
+        for pipe in _PIPES:
+            copyreg.pickle(pipe, _refuse_pipe)
         self.shared: dict[int, Any] = {}
         self.reason = ""
         self._memo: dict[int, Any] = {}  # of `copy.deepcopy`: copies by the `id` of originals
@@ -71,8 +82,12 @@ class Copy:
         return layer
 
 
-def _refuse_pipe(_: connection.Connection) -> NoReturn:
-    """Refuse to copy the end of a pipe: a copy closes the original when it is deleted."""
+def _refuse_pipe(_: Any) -> NoReturn:
+    """Raise a TypeError in place of a copy of a pipe, which closes the original when deleted.
+
+    Neither `copy` nor `pickle` copies a pipe of use. `multiprocessing` passes pipes to other
+    processes by functions that it registers itself.
+    """
     raise TypeError("a pipe to another process cannot be copied")
 
 

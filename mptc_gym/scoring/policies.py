@@ -37,7 +37,7 @@ class Form(NamedTuple):
 
 
 def form_of(policy: Any) -> Form:
-    """Return how a policy is called; ValueError if it has none of the four forms."""
+    """Return how a policy is called; raise a ValueError if it has none of the four forms."""
     if is_environment(policy):
         reject("policy", policy, "a policy, which comes first: evaluate(policy, env)")
     if isinstance(policy, type):
@@ -62,9 +62,25 @@ def form_of(policy: Any) -> Form:
 def start(policy: Any, n: int) -> Act:
     """Reset a policy for n episodes, and return its function of observations.
 
-    `reset()` is called on the object that the policy is, or whose `predict` or `act` it is, if
-    the object has this method. It is not called on the owner of another method. A ValueError is
-    raised if the policy has none of the four forms.
+    Parameters
+    ----------
+    policy
+        A policy in one of the four forms. If it is an object with a method `reset`, or the
+        bound `predict` or `act` of such an object, `reset()` is called. For a method of another
+        name, `reset()` of its object is not called.
+    n
+        Number of plants.
+
+    Returns
+    -------
+    function
+        It takes observations in NumPy arrays, one row for each plant, and returns what the
+        policy returns as actions.
+
+    Raises
+    ------
+    ValueError
+        If the policy has none of the four forms.
     """
     form = form_of(policy)
     reset = getattr(form.target, "reset", None)
@@ -81,16 +97,17 @@ def start(policy: Any, n: int) -> Act:
 def _predicting(predict: Callable[..., Any], n: int) -> Act:
     """Return a `predict` in the form of Stable-Baselines3 as a function of observations.
 
-    The function is for one round of n episodes. It passes `state`, `episode_start` and
-    `deterministic=True`, except those that `predict` does not take or that a
-    `functools.partial` has set.
+    The function is for one round of n episodes. It passes the keywords `state`,
+    `episode_start` and `deterministic=True` to `predict`, except keywords that `predict` does
+    not take, and keywords that a `functools.partial` has set.
     """
     parameters = inspect.signature(predict).parameters
-    takes_all = any(item.kind is item.VAR_KEYWORD for item in parameters.values())
-    settled = predict.keywords if isinstance(predict, partial) else {}
+    kinds = {parameter.kind for parameter in parameters.values()}
+    takes_all = inspect.Parameter.VAR_KEYWORD in kinds
+    set_by_partial = predict.keywords if isinstance(predict, partial) else {}
     keywords = {"state": None, "episode_start": np.ones(n, np.bool_), "deterministic": True}
     for name in [*keywords]:
-        if name in settled or not (takes_all or name in parameters):
+        if name in set_by_partial or not (takes_all or name in parameters):
             del keywords[name]
 
     def act(observations: Any) -> Any:
