@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
@@ -15,13 +15,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from mptc_gym.checks import MOST_PLANTS, count, reject
 from mptc_gym.making import make_batch, make_one
 from mptc_gym.wrappers import IncrementalAction
-
-
-class _Place(NamedTuple):
-    """Where an environment is: the number of its batch, and its row in the batch."""
-
-    batch: int
-    row: int
 
 
 class GymnasiumVecEnv(VecEnv):
@@ -54,12 +47,10 @@ class GymnasiumVecEnv(VecEnv):
         self.group = group
         self.infos: dict[str, Any] = {}
         self._slices: list[slice] = []  # the numbers of the environments of each batch
-        self._places: list[_Place] = []  # of each environment
-        for number, batch in enumerate(batches):
-            first = len(self._places)
-            self._slices.append(slice(first, first + batch.num_envs))
-            self._places += [_Place(number, row) for row in range(batch.num_envs)]
-        num_envs = len(self._places)
+        num_envs = 0
+        for batch in batches:
+            self._slices.append(slice(num_envs, num_envs + batch.num_envs))
+            num_envs += batch.num_envs
         self._next_seeds: list[int | None] = [None] * num_envs
         self._returns = np.zeros(num_envs)  # of the episode so far
         self._lengths = np.zeros(num_envs, np.int64)  # of the episode so far, samples
@@ -89,9 +80,10 @@ class GymnasiumVecEnv(VecEnv):
         self._lengths[:] = 0
         observations, infos = zip(*returned, strict=True)
         self.infos = _joined(infos)
-        self.reset_infos = [
-            _infos_of_one(infos[place.batch], place.row) for place in self._places
-        ]
+        self.reset_infos = []
+        for infos_of_batch, batch in zip(infos, self.batches, strict=True):
+            rows = range(batch.num_envs)
+            self.reset_infos += [_infos_of_one(infos_of_batch, row) for row in rows]
         return np.concatenate(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -111,18 +103,19 @@ class GymnasiumVecEnv(VecEnv):
         self._returns += rewards
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in ended]
-        for index in np.flatnonzero(ended).tolist():
-            batch, row = self._places[index]
-            infos[index] = {
-                **_infos_of_one(batch_infos[batch]["final_info"], row),
-                "terminal_observation": batch_infos[batch]["final_obs"][row],
-                "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
-                "episode": {
-                    "r": self._returns[index].item(),
-                    "l": self._lengths[index].item(),
-                },
-            }
-            self.reset_infos[index] = _infos_of_one(batch_infos[batch], row)
+        for infos_of_batch, numbers in zip(batch_infos, self._slices, strict=True):
+            for row in np.flatnonzero(ended[numbers]).tolist():
+                index = numbers.start + row
+                infos[index] = {
+                    **_infos_of_one(infos_of_batch["final_info"], row),
+                    "terminal_observation": infos_of_batch["final_obs"][row],
+                    "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
+                    "episode": {
+                        "r": self._returns[index].item(),
+                        "l": self._lengths[index].item(),
+                    },
+                }
+                self.reset_infos[index] = _infos_of_one(infos_of_batch, row)
         self._returns[ended] = 0.0
         self._lengths[ended] = 0
         return observations, rewards.astype(np.float32), ended, infos
@@ -141,10 +134,12 @@ class GymnasiumVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of each environment's batch, or the spec of one environment."""
-        places = [self._places[index] for index in self._get_indices(indices)]
-        if attr_name == "spec":
-            return [self.spec for _ in places]
-        return [getattr(self.batches[place.batch], attr_name) for place in places]
+        values = [self.spec] * self.num_envs
+        if attr_name != "spec":
+            values = []
+            for batch in self.batches:
+                values += [getattr(batch, attr_name)] * batch.num_envs
+        return [values[index] for index in self._get_indices(indices)]
 
     def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Refuse: an environment of a batch has no methods or attributes for itself."""
@@ -161,9 +156,10 @@ class GymnasiumVecEnv(VecEnv):
 
 def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
     """Concatenate the arrays in the infos of batches that all batches have, by name."""
+    common_names = set(infos[0]).intersection(*infos[1:])
     joined = {}
     for name, values in infos[0].items():
-        if isinstance(values, np.ndarray) and all(name in of_batch for of_batch in infos):
+        if name in common_names and isinstance(values, np.ndarray):
             joined[name] = np.concatenate([of_batch[name] for of_batch in infos])
     return joined
 
