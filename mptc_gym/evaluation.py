@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import resources
@@ -11,37 +12,38 @@ from typing import Any, Final, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.acting import Replay, opened, rollout
-from mptc_gym.adapters import Plants, VectorPlants
 from mptc_gym.checks import MOST_PLANTS, count
-from mptc_gym.fit import check_fit
+from mptc_gym.layers import plant_groups
 from mptc_gym.parameters import ARGUMENTS, Parameters
 from mptc_gym.plant import action_from_command
-from mptc_gym.policies import Act, check_policy, start
 from mptc_gym.presets import IDS
+from mptc_gym.scoring.fit import check_fit
+from mptc_gym.scoring.opening import Plants, opened
+from mptc_gym.scoring.policies import start
+from mptc_gym.scoring.rollout import Sample, replayed, rollout
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
-Values = NDArray[np.float64]  # one per episode, shape (episodes,)
+Values = NDArray[np.float64]  # one number for each episode, shape (episodes,)
 
-SEED: Final = 7_000_000  # of the first published episode, as the next one has the next seed
+SEED: Final = 7_000_000  # of the first published episode; the next episode has the next seed
 EPISODES: Final = 100
-VALIDATION_SEED: Final = 5_000_000  # of the first episode to choose by, never published
+VALIDATION_SEED: Final = 5_000_000  # of the first episode to choose by, which no result shows
 VALIDATION_EPISODES: Final = 200
 SAMPLES: Final = 1200  # of an episode, unless its environment ends it earlier
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 # Arguments that change observations or rewards, but not the least possible error.
 _NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
-_RESAMPLES: Final = 2000  # bootstrap resamples
+_RESAMPLES: Final = 2000  # of the episodes, for the bootstrap interval
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
-    """Result of `evaluate`, shown in one line.
+    """The result of `evaluate`. Its text is one line.
 
     Attributes
     ----------
     env : str
-        The environment's id, or the name of its class.
+        The id of the environment, or the name of its class if it has no id.
     mean_error, travel : float
         Means of `errors` and `travels`.
     errors, travels : ndarray, shape (episodes,)
@@ -49,19 +51,20 @@ class Evaluation:
     seeds : range
         Seeds of the episodes.
     note : str
-        Why there is no score, or why it is 0, and what to do; empty if neither is so.
+        Why there is no score, or why the score is 0, and what to do. The note is empty if there
+        is a score other than 0.
     least_possible : float or None
-        Least possible mean error, degC. This and all that follows are None where the package
-        has no bound: `note` says why.
+        Least possible mean error, degC. This and all following attributes are None where the
+        package has no bound: `note` says why.
     multiple : float or None
         `mean_error / least_possible`.
     score : float or None
-        0 for a valve that is left alone, 1 for the least possible error.
+        0 for the error of a valve that never moves, 1 for the least possible error.
     interval : (float, float) or None
         95 % bootstrap interval of the score, from resampled episodes.
     least, scores : ndarray or None, shape (episodes,)
-        Least possible error of each episode, degC, and its score against it. Where only noise
-        and load are drawn, the error is its expectation over these.
+        Least possible mean error of each episode, degC, and score of each episode. Where only
+        noise and load are drawn, `least` is the expected value over noise and load.
     """
 
     env: str
@@ -104,41 +107,44 @@ def evaluate(
     """Run a policy on fixed episodes and score it.
 
     As with `evaluate_policy` of Stable-Baselines3, the policy acts in exactly the environments
-    that are handed over: their windows, wrappers and statistics must be those of its training.
-    Nothing of them changes, as the policy acts in a copy. So a training may score its model in
-    its own environments.
+    that are handed over: the windows, wrappers and statistics of these environments must be
+    those of the policy's training. The policy acts in a copy, so that the environments do not
+    change. A training may therefore score its model in the environments of the training.
 
     Parameters
     ----------
     policy
-        One of four forms:
+        A policy has one of four forms:
 
-        - an object with `predict`, as a model of Stable-Baselines3; it gets `state`,
-          `episode_start` and `deterministic=True`, except those that it does not take;
-        - an object with `act`, as those in `agents`, which takes and returns NumPy arrays;
-        - a `torch.nn.Module`, or a method of one: it gets a tensor, of float32 unless its
-          weights are of another type, is in evaluation mode, and computes no gradients;
+        - an object with `predict`, such as a model of Stable-Baselines3; `predict` receives
+          `state`, `episode_start` and `deterministic=True`, if it takes these arguments;
+        - an object with `act`, such as a controller in `agents`; `act` takes observations and
+          returns actions in NumPy arrays;
+        - a `torch.nn.Module`, or a method of a module; it receives a tensor of the type of the
+          module's weights; the module is in evaluation mode, and computes no gradients;
         - any other function of observations, shape (n, size), that returns actions, shape
           (n, 1), in NumPy arrays.
 
         A bound `predict` or `act` stands for its object, and a `functools.partial` for its
-        function. If the object has a method `reset`, it is called before each round of
-        episodes. What a policy learns in an evaluation stays with it.
+        function. If the object has a method `reset`, this method is called before each round of
+        episodes. What a policy learns in an evaluation stays with the policy.
     env
         An id, such as one of `IDS`, or an `EnvSpec`; a function that makes one environment in
-        each call; or environments: one, a vector environment of Gymnasium, or a `VecEnv` of
-        Stable-Baselines3, such as `model.get_env()`. The latter run several rounds if they are
-        fewer than `episodes`.
+        each call; or environments: a single environment, a vector environment of Gymnasium, or
+        a `VecEnv` of Stable-Baselines3, such as `model.get_env()`. If there are fewer
+        environments than `episodes`, the environments run several rounds.
 
         Environments in other processes, in a window, or with anything else that cannot be
-        copied act themselves, and begin a new episode afterwards; where a model trains in
-        them, this is an error. A copy shares what closures, global random streams and files
-        opened by name refer to.
-    episodes, seed
-        Number of episodes, at least 2, and seed of the first. The default is that of all
-        published scores. To choose among policies, use `seed=VALIDATION_SEED`, of
-        `mptc_gym.evaluation`, with at most 200 episodes: they are never published. An episode
-        has 1,200 samples, or fewer if its environment ends it earlier.
+        copied act themselves, and begin a new episode afterwards. A ValueError is raised if the
+        policy is a model that trains in such environments. Original and copy share files that
+        they open by name, global random streams, and variables to which functions refer.
+    episodes
+        Number of episodes, at least 2. An episode has 1,200 samples, or fewer if its
+        environment ends it earlier.
+    seed
+        Seed of the first episode; the next episode has the next seed. The default is the seed
+        of all published scores. To choose among policies, import `VALIDATION_SEED` from
+        `mptc_gym.evaluation`: no published score uses the 200 episodes from this seed on.
     **arguments
         Further arguments for an id or a spec, as in `gymnasium.make`.
 
@@ -150,10 +156,10 @@ def evaluate(
     Raises
     ------
     ValueError
-        If the environment does not exist, is not one of this package or runs other episodes
-        than those of its seeds; or if the policy or its actions do not fit it. A model of
-        Stable-Baselines3 that still has its environments is compared with them: windows, and
-        wrappers by name.
+        If the environment does not exist, is not of this package or runs other episodes than
+        those of its seeds; or if the policy or its actions do not fit the environment. If a
+        model of Stable-Baselines3 still has the environments of its training, `env` must have
+        the same windows, and wrappers of the same names.
 
     Examples
     --------
@@ -171,29 +177,28 @@ valve travel 10 t/h; 100 episodes, all alike
     >>> mptc_gym.evaluate(model, model.get_env())
     >>> mptc_gym.evaluate(model, spec_of(model, "MiddlePointHard-v0"))
     """
-    check_policy(policy)
     episodes = count("episodes", episodes, 2, MOST_PLANTS)
     first = count("seed", seed, 0, 2**63)
     seeds = range(first, first + episodes)
     with opened(env, episodes, policy, **arguments) as plants:
-        name = plants.groups[0].name
-        parameters = plants.groups[0].parameters
-        case = case_of(parameters)
-        if any(case_of(group.parameters) != case for group in plants.groups):
-            raise ValueError("env must have the same plants, but for windows and rewards")
         check_fit(policy, plants)
-        reference = None if plants.are_trusted else parameters
-        runs = _run(policy, plants, seeds, reference)
+        groups = plant_groups(plants)
+        parameters = groups[0].parameters
+        case = case_of(parameters)
+        if any(case_of(group.parameters) != case for group in groups):
+            raise ValueError("env must have the same plants, but for windows and rewards")
+        runs = _run(policy, plants, seeds, parameters)
     bound = find_bound(case, runs.samples, seeds)
     judged = {} if bound.least is None else _judge(runs.errors, bound.least, case, seeds)
+    notes = [bound.why_not, _why_idle(runs, parameters)]
     return Evaluation(
-        env=name,
+        env=groups[0].name,
         mean_error=float(runs.errors.mean()),
         travel=float(runs.travels.mean()),
         errors=runs.errors,
         travels=runs.travels,
         seeds=seeds,
-        note="; ".join(filter(None, [bound.why_not, _why_idle(runs, parameters)])),
+        note="; ".join(filter(None, notes)),
         **judged,
     )
 
@@ -206,60 +211,56 @@ class _Runs(NamedTuple):
     samples: int  # N, of each episode
 
 
-def _run(
-    policy: Any, plants: Plants, seeds: range, reference: Parameters | None = None
-) -> _Runs:
-    """Run an episode per seed, in as many rounds as it takes.
+def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _Runs:
+    """Run an episode for each seed, in as many rounds as the number of plants requires.
 
-    With `reference`, episodes that differ from those of plants with these arguments are a
-    ValueError, as are episodes of different lengths.
+    `parameters` are those of the plants. A ValueError is raised if episodes have different
+    lengths, or if they are not those of the seeds.
     """
-    rounds: list[_Runs] = []
     n = plants.num_envs
+    rounds: list[_Runs] = []
     for first in seeds[::n]:
-        act = start(policy, n)
-        rounds.append(_run_round(act, plants, [*range(first, first + n)], reference))
+        seeds_of_round = [*range(first, first + n)]
+        samples = rollout(plants, start(policy, n), SAMPLES, seeds_of_round)
+        if type(plants) is not MiddlePointVectorEnv:  # wrappers may change the episodes
+            samples = replayed(samples, parameters, seeds_of_round)
+        rounds.append(_measure(samples, n))
         if rounds[-1].samples != rounds[0].samples:
             _refuse_lengths(rounds[-1].samples)
-    return _Runs(
-        np.hstack([part.errors for part in rounds])[: len(seeds)],
-        np.hstack([part.travels for part in rounds])[: len(seeds)],
-        rounds[0].samples,
-    )
+    # The last round may have more episodes than are asked for.
+    errors = np.hstack([runs.errors for runs in rounds])[: len(seeds)]
+    travels = np.hstack([runs.travels for runs in rounds])[: len(seeds)]
+    return _Runs(errors, travels, rounds[0].samples)
 
 
-def _run_round(
-    act: Act, plants: Plants, seeds: list[int], reference: Parameters | None
-) -> _Runs:
-    """Run one episode of each plant, of `SAMPLES` samples or until it ends: see `_run`."""
-    replay = None if reference is None else Replay(reference, seeds)
-    total_errors = np.zeros(plants.num_envs)
-    travels = np.zeros(plants.num_envs)
-    applied = np.zeros(plants.num_envs)  # at rest
-    samples = 0
-    steps = rollout(plants, act, SAMPLES, seeds)
-    initial = next(steps)
-    if replay is not None:
-        replay.check_reset(initial.infos)
-    for sample in steps:
-        samples += 1
-        if replay is not None:
-            replay.check_step(sample.infos)
+def _measure(samples: Iterator[Sample], n: int) -> _Runs:
+    """Sum up the samples of n episodes until these end; ValueError if not all end at once."""
+    next(samples)  # k = 0, before which no policy has acted
+    total_errors = np.zeros(n)
+    travels = np.zeros(n)
+    applied = np.zeros(n)  # t/h, at rest
+    length = 0
+    for sample in samples:
+        length += 1
         total_errors += np.abs(sample.infos["error"])
         travels += np.abs(sample.infos["applied"] - applied)
         applied = sample.infos["applied"]
         if sample.ended.any():
             if not sample.ended.all():
-                _refuse_lengths(samples)
+                _refuse_lengths(length)
             break
-    return _Runs(total_errors / samples, travels, samples)
+    return _Runs(total_errors / length, travels, length)
+
+
+def _refuse_lengths(samples: int) -> NoReturn:
+    raise ValueError(f"env must end all episodes at once, got an end after {samples} samples")
 
 
 def _why_idle(runs: _Runs, parameters: Parameters) -> str:
-    """Return why the valve has never moved, and what helps; "" if it has."""
-    low, high = parameters.range_of("dead_zone")
+    """Return why the valve has never moved, and what helps; "" if the valve has moved."""
     if runs.travels.any():
         return ""
+    low, high = parameters.range_of("dead_zone")
     if high == 0.0:
         return "the valve never moved"
     zone = f"{low:g}" if low == high else f"{low:g} to {high:g}"
@@ -269,21 +270,27 @@ def _why_idle(runs: _Runs, parameters: Parameters) -> str:
     )
 
 
-def _refuse_lengths(samples: int) -> NoReturn:
-    raise ValueError(f"env must end all episodes at once, got an end after {samples} samples")
-
-
 class Bound(NamedTuple):
-    """The least possible mean error of each episode, degC, or the reason why it is missing."""
+    """The least possible mean error of each episode, or the reason why it is missing."""
 
-    least: Values | None
+    least: Values | None  # degC
     why_not: str = ""
 
 
 def find_bound(parameters: Parameters, samples: int, seeds: range) -> Bound:
-    """Return the least possible mean error of each episode, as far as the package has it."""
-    case = _read_bounds().get(case_of(parameters))
-    if case is None:
+    """Return the least possible mean error of each episode, if the package has it.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the plants.
+    samples
+        Length N of an episode.
+    seeds
+        The seeds of the episodes.
+    """
+    least_by_seed = _read_bounds().get(case_of(parameters))
+    if least_by_seed is None:
         return Bound(
             None,
             "bounds are kept for the presets alone, without other arguments of the plant; in a "
@@ -295,12 +302,13 @@ def find_bound(parameters: Parameters, samples: int, seeds: range) -> Bound:
             f"bounds are kept for episodes of {SAMPLES:,} samples, not of {samples:,}: leave "
             "max_episode_steps as it is",
         )
-    if case.is_the_same_for_all_seeds:
-        return Bound(np.repeat(case.least[SEED], len(seeds)))
-    for first, least in case.least.items():
+    if len(least_by_seed[SEED]) == 1:  # the same for all seeds: only noise and load are drawn
+        return Bound(np.repeat(least_by_seed[SEED], len(seeds)))
+    ranges = []
+    for first, least in least_by_seed.items():
         if first <= seeds.start and seeds.stop <= first + len(least):
             return Bound(least[seeds.start - first : seeds.stop - first])
-    ranges = [f"{first:,} to {first + len(least) - 1:,}" for first, least in case.least.items()]
+        ranges.append(f"{first:,} to {first + len(least) - 1:,}")
     return Bound(
         None,
         f"bounds of these plants are kept for seeds {' and '.join(ranges)}, not for "
@@ -308,43 +316,48 @@ def find_bound(parameters: Parameters, samples: int, seeds: range) -> Bound:
     )
 
 
-class _Case(NamedTuple):
-    """The bounds of a case of `bounds.json`."""
-
-    least: dict[int, Values]  # by the seed of the first episode
-
-    @property
-    def is_the_same_for_all_seeds(self) -> bool:
-        """Whether only noise and load are random, if anything."""
-        return len(self.least[SEED]) == 1
-
-
 @cache
-def _read_bounds() -> dict[Parameters, _Case]:
-    """Return the bounds written by `python -m benchmarks.bounds --package`, by case."""
+def _read_bounds() -> dict[Parameters, dict[int, Values]]:
+    """Return the bounds that `python -m benchmarks.bounds --package` wrote.
+
+    The bounds are by case, and of a case by the seed of the first episode: least possible mean
+    errors of this episode and of the next ones, degC.
+    """
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
-    cases = {}
+    bounds = {}
     for record in json.loads(text)["cases"].values():
-        least = {SEED: np.array(record["least"])}
+        least_by_seed = {SEED: np.array(record["least"])}
         if "validation_least" in record:
-            least[VALIDATION_SEED] = np.array(record["validation_least"])
-        cases[case_of(Parameters(**record["arguments"]))] = _Case(least)
-    return cases
+            least_by_seed[VALIDATION_SEED] = np.array(record["validation_least"])
+        bounds[case_of(Parameters(**record["arguments"]))] = least_by_seed
+    return bounds
 
 
 def case_of(parameters: Parameters) -> Parameters:
-    """Return the arguments, with those that do not affect the bound at their defaults."""
+    """Return parameters, with those that do not affect the bound at their defaults."""
     return replace(parameters, **{name: ARGUMENTS[name].default for name in _NO_MATTER})
 
 
 def _judge(
     errors: Values, least: Values, parameters: Parameters, seeds: range
 ) -> dict[str, Any]:
-    """Return what an `Evaluation` says of errors beside the least possible ones."""
+    """Return the fields of an `Evaluation` that compare errors with the least possible ones.
+
+    Parameters
+    ----------
+    errors, least
+        Mean error and least possible mean error of each episode, degC, shape (episodes,).
+    parameters
+        The arguments of the plants.
+    seeds
+        The seeds of the episodes.
+    """
     n = len(seeds)
+    idle_plants = MiddlePointVectorEnv(n, **asdict(parameters))
     idle_action = action_from_command(0.0, parameters.u_min, parameters.u_max)
-    idle_plants = VectorPlants(MiddlePointVectorEnv(n, **asdict(parameters)))
-    idle_errors = _run(lambda _: np.full((n, 1), idle_action), idle_plants, seeds).errors
+    idle_actions = np.full((n, 1), idle_action)
+    idle_samples = rollout(idle_plants, lambda _: idle_actions, SAMPLES, [*seeds])
+    idle_errors = _measure(idle_samples, n).errors
     gained = idle_errors - errors
     possible = idle_errors - least
     generator = np.random.default_rng(0)

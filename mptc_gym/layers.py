@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 import gymnasium
@@ -15,10 +14,12 @@ from mptc_gym.parameters import Parameters
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
 VEC_ENV: Final = "stable_baselines3.common.vec_env"
-# Where environments of Gymnasium, Stable-Baselines3 and this package hold those within them.
+# The attributes in which environments of Gymnasium, Stable-Baselines3 and this package hold
+# the environments within them.
 INNER: Final = ("venv", "env", "envs", "batches")
 # Layers that change neither observations nor actions, by the name of their class.
 _NEUTRAL: Final = frozenset({
+    "MiddlePointEnv",
     "AsyncVectorEnv", "DummyVecEnv", "GymnasiumVecEnv", "SubprocVecEnv", "SyncVectorEnv",
     "Autoreset", "DictInfoToList", "Monitor", "OrderEnforcing", "PassiveEnvChecker",
     "RecordEpisodeStatistics", "TimeLimit", "VecCheckNan", "VecMonitor",
@@ -27,25 +28,28 @@ _NEUTRAL: Final = frozenset({
     "RenderCollection", "VecVideoRecorder",
 })  # fmt: skip
 
-Chain = tuple[str, ...]  # of wrappers, outermost first
-
 
 class PlantGroup(NamedTuple):
-    """Plants with the same arguments: one environment, or one batch."""
+    """Plants with the same arguments and wrappers: one environment, or one batch."""
 
     parameters: Parameters
     num_envs: int
-    name: str  # id of the environment, or the name of its class where it has none
+    name: str  # id of the environment, or the name of its class if it has no id
+    # The classes of the wrappers that change observations or actions, outermost first.
+    wrappers: tuple[str, ...]
 
 
 def loaded(name: str) -> Any:
-    """Return a class by its full name if it is imported; otherwise (), without instances."""
+    """Return the class with this full name, or () if its module has not been imported.
+
+    The result is the second argument of an `isinstance`, which is False for ().
+    """
     module, _, class_name = name.rpartition(".")
     return getattr(sys.modules.get(module), class_name, ())
 
 
 def is_environment(env: Any) -> bool:
-    """Whether this is an environment or many, of Gymnasium or of Stable-Baselines3."""
+    """Whether `env` is an environment or several, of Gymnasium or of Stable-Baselines3."""
     return isinstance(env, (gymnasium.Env, VectorEnv, loaded(f"{VEC_ENV}.VecEnv")))
 
 
@@ -54,8 +58,16 @@ def runs_processes(layer: Any) -> bool:
     return isinstance(layer, (AsyncVectorEnv, loaded(f"{VEC_ENV}.SubprocVecEnv")))
 
 
+def normaliser_flag(layer: Any) -> str:
+    """Return the attribute by which a layer updates its statistics; "" if it has none."""
+    if isinstance(layer, loaded(f"{VEC_ENV}.VecNormalize")):
+        return "training"
+    # The wrappers of Gymnasium that normalise, of one environment or of many.
+    return "update_running_mean" if hasattr(type(layer), "update_running_mean") else ""
+
+
 def inner_environments(env: Any) -> list[Any]:
-    """Return the environments directly within an environment of this process."""
+    """Return the environments directly within an environment; none from other processes."""
     inner: list[Any] = []
     for name in INNER:
         value = vars(env).get(name)
@@ -65,48 +77,44 @@ def inner_environments(env: Any) -> list[Any]:
 
 
 def layers(env: Any) -> Iterator[Any]:
-    """Yield an environment and all environments of this process within it."""
+    """Yield an environment and all environments within it, the outermost first.
+
+    Environments in other processes are not included.
+    """
     yield env
     for inner in inner_environments(env):
         yield from layers(inner)
 
 
-def have_a_layer_in_common(env: Any, other: Any) -> bool:
-    """Whether two environments have a layer in common."""
-    identities = {id(layer) for layer in layers(other)}
-    return any(id(layer) in identities for layer in layers(env))
+def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
+    """Return the plants in an environment, also those in other processes, in their order.
 
+    Parameters
+    ----------
+    env
+        An environment of any kind.
+    outer
+        The names of the wrappers around `env`, outermost first.
 
-def plant_groups(env: Any) -> list[PlantGroup]:
-    """Return the plants in an environment, in their order; none if it is not open."""
-    groups: list[PlantGroup] = []
-    for layer in layers(env):
-        if isinstance(layer, MiddlePointEnv | MiddlePointVectorEnv):
-            name = layer.spec.id if layer.spec else type(layer).__name__
-            groups.append(PlantGroup(layer.parameters, getattr(layer, "num_envs", 1), name))
-        elif runs_processes(layer):
-            groups += Processes(layer).plant_groups()
-    return groups
-
-
-def wrapper_chains(env: Any) -> set[Chain]:
-    """Return what changes observations and actions of each plant, outermost first.
-
-    The wrappers of a plant are named by their classes, `IncrementalAction` with its arguments.
-    Plants that are wrapped alike share one element. Environments in other processes that do
-    not answer are left out.
+    Returns
+    -------
+    list of PlantGroup
+        The list is empty if `env` holds no plants of this package in NumPy, or if its processes
+        are closed.
     """
-    outer: Chain = ()
+    wrappers = outer
     if _changes_policy(env):
-        outer = (_described(type(env).__name__, vars(env).get("increments")),)
-    inner = inner_environments(env)
+        increments = vars(env).get("increments", "")  # the arguments of an IncrementalAction
+        wrappers = (*outer, f"{type(env).__name__}{increments}")
+    if isinstance(env, MiddlePointEnv | MiddlePointVectorEnv):
+        name = env.spec.id if env.spec else type(env).__name__
+        return [PlantGroup(env.parameters, getattr(env, "num_envs", 1), name, wrappers)]
     if runs_processes(env):
-        inner_chains = Processes(env).wrapper_chains()
-    elif inner:
-        inner_chains = set().union(*map(wrapper_chains, inner))
-    else:
-        return {()}
-    return {outer + chain for chain in inner_chains}
+        return _groups_in_processes(env, wrappers)
+    groups: list[PlantGroup] = []
+    for inner in inner_environments(env):
+        groups += plant_groups(inner, wrappers)
+    return groups
 
 
 def _changes_policy(layer: Any) -> bool:
@@ -120,72 +128,32 @@ def _changes_policy(layer: Any) -> bool:
     return isinstance(layer, (*wrappers, loaded(f"{VEC_ENV}.VecEnvWrapper")))
 
 
-def _described(class_name: str, increments: Any) -> str:
-    """Return how a wrapper is named: by its class, and its increments where it has any."""
-    return class_name if increments is None else f"{class_name}{increments}"
+def ask_processes(env: Any, method: str, *arguments: Any) -> list[Any]:
+    """Return what a method of each environment in other processes returns.
 
-
-class Processes:
-    """Environments in other processes, which are asked through pipes.
-
-    A question that an environment cannot answer, or whose answer cannot be pickled, ends its
-    process. So each is asked only for what it has, and for what this package defined.
+    A method that an environment does not have, or whose result cannot be pickled, ends the
+    process of the environment.
     """
+    ask = getattr(env, "env_method", None) or env.call
+    return list(ask(method, *arguments))
 
-    def __init__(self, env: Any) -> None:
-        self._env = env
-        self._ask = getattr(env, "env_method", None) or env.call
-        self._names: list[_Names] = []
-        with suppress(Exception):  # whatever closed or broken ones raise
-            self._names = [_Names.of(text) for text in self._ask("__str__")]
 
-    def plant_groups(self) -> list[PlantGroup]:
-        """Return the plants; none if the processes are closed or run something else."""
-        groups = []
-        for names, parameters in zip(self._names, self._values("parameters"), strict=False):
-            if isinstance(parameters, Parameters):
-                groups.append(PlantGroup(parameters, 1, names.plant))
-        return groups
-
-    def wrapper_chains(self) -> set[Chain]:
-        """Return what changes observations and actions: see the function of this name."""
-        increments = self._values("increments")
-        chains = set()
-        for index, names in enumerate(self._names):
-            chain = []
-            for class_name in names.wrappers:
-                if class_name == "IncrementalAction" and increments:
-                    chain.append(_described(class_name, increments[index]))
-                elif class_name not in _NEUTRAL:
-                    chain.append(class_name)
-            chains.add(tuple(chain))
-        return chains
-
-    def seeds(self) -> list[int]:
-        """Return the latest seed of each environment."""
-        return list(self._env.get_attr("np_random_seed")) if self._names else []
-
-    def normalise(self) -> bool:
-        """Whether a wrapper of Gymnasium normalises in one of the processes."""
-        return bool(self._names) and any(self._ask("has_wrapper_attr", "update_running_mean"))
-
-    def _values(self, name: str) -> list[Any]:
-        """Return an attribute of each environment; nothing unless all have it."""
-        if self._names and all(self._ask("has_wrapper_attr", name)):
-            return list(self._env.get_attr(name))
+def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
+    """Return the plants in other processes: see `plant_groups`."""
+    try:
+        texts = ask_processes(env, "__str__")
+        if not all(ask_processes(env, "has_wrapper_attr", "parameters")):
+            return []
+        parameters = env.get_attr("parameters")
+    except Exception:  # whatever closed or broken processes raise
         return []
-
-
-class _Names(NamedTuple):
-    """The names in the text of an environment of Gymnasium."""
-
-    wrappers: list[str]  # classes, outermost first
-    plant: str  # id of the innermost environment, or the name of its class
-
-    @classmethod
-    def of(cls, text: str) -> _Names:
-        """Read a text such as "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>"."""
-        *outer, last = text.strip("<>").split("<")
-        if last.endswith(" instance"):  # without an id: "<TimeLimit<MiddlePointEnv instance>>"
-            return cls(outer, last.removesuffix(" instance"))
-        return cls(outer[:-1], last)
+    groups = []
+    for text, plant_parameters in zip(texts, parameters, strict=True):
+        # An example of a text is "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>". For an
+        # environment without an id, it is "<TimeLimit<MiddlePointEnv instance>>".
+        *classes, last = text.strip("<>").split("<")
+        wrappers = tuple(name for name in classes if name not in _NEUTRAL)
+        if isinstance(plant_parameters, Parameters):
+            name = last.removesuffix(" instance")
+            groups.append(PlantGroup(plant_parameters, 1, name, outer + wrappers))
+    return groups

@@ -1,4 +1,4 @@
-"""Describe plants to a teacher: numbers that a policy cannot see."""
+"""Describe plants to a teacher, by numbers that a policy cannot see."""
 
 from __future__ import annotations
 
@@ -11,28 +11,38 @@ from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 
 class PlantState(NamedTuple):
-    """What a teacher may know of n plants at the present sample, all of shape (n,).
+    """What a teacher may know of n plants at the present sample.
 
-    The fields are NumPy arrays of float64, or tensors of the environment's type and device.
+    Each field has the shape (n,). The fields are NumPy arrays of float64, or tensors of the
+    type and on the device of the environment.
     """
 
     delay: Any  # samples
     dead_zone: Any  # half width, t/h
     gain: Any  # in the steady state, degC per t/h
-    time_constant: Any  # the dominant one, s; NaN if A of (28) has none
+    time_constant: Any  # the dominant time constant, s; NaN if A of (28) has none
     load: Any  # w, degC
 
 
 def plant_state(
     parameters: Parameters, numbers: Mapping[str, Any], ages: Any, load: Any
 ) -> PlantState:
-    """Return the state of plants, given what was drawn, k and w(k) of each, shape (n,).
+    """Return the state of n plants at the present sample.
 
-    `numbers` are the arguments that are ranges, by name, shape (n,).
+    Parameters
+    ----------
+    parameters
+        The arguments of the plants.
+    numbers
+        The numbers that were drawn for the arguments that are ranges, by name, shape (n,).
+    ages
+        The sample k of the episode of each plant, shape (n,).
+    load
+        The load w(k) of each plant, degC, shape (n,).
     """
     nominal = {name: parameters.range_of(name)[0] for name in PLANT_NUMBERS}
     plants: PlantNumbers[Any] = PlantNumbers(**{**nominal, **numbers})
-    # Dynamics that drift change at multiples of the interval.
+    # Dynamics that drift change at samples that are multiples of the interval.
     changed_at = ages - ages % DRIFT_INTERVAL
     gain_factor, time_constant_factor = Dynamics(parameters).factors(plants, changed_at)
     zeros = load * 0.0

@@ -38,9 +38,9 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
 """The arguments of the environment in each preset, by its name.
 
 "paper", "dead-zone-7" and "noisy" are the three cases of the paper. "disturbed" adds
-measurement noise and a load disturbance; "fouling" adds drifts of gain and time constant to
-these. "randomised" draws the plant and its noise at each reset. "hard" combines all of this
-with random set points.
+measurement noise and a load disturbance to "noisy". "fouling" adds drifts of gain and time
+constant to "disturbed". "randomised" draws the plant and the variance of its noise at each
+reset. "hard" combines the disturbances, drifts and random plants with random set points.
 """
 
 IDS: Final[dict[str, str]] = {

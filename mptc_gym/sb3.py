@@ -9,13 +9,13 @@ Requires `pip install "mptc_gym[sb3]"`.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import pkgutil
 import tempfile
+import uuid
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -24,18 +24,16 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env import sync_envs_normalization as bring_statistics
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 
-from mptc_gym.acting import opened, refuse_the_models_own
-from mptc_gym.adapters import adapted
 from mptc_gym.checks import MOST_PLANTS, count, reject
-from mptc_gym.copies import copied
 from mptc_gym.evaluation import VALIDATION_SEED, WINDOWS, Evaluation, evaluate
-from mptc_gym.fit import check_fit
-from mptc_gym.layers import have_a_layer_in_common, is_environment, plant_groups
+from mptc_gym.layers import is_environment, layers, plant_groups
 from mptc_gym.making import make_batch, make_one
 from mptc_gym.sb3_vec_env import GymnasiumVecEnv, make_vec_env
+from mptc_gym.scoring.copies import Copy
+from mptc_gym.scoring.fit import check_fit
+from mptc_gym.scoring.opening import opened
 
 __all__ = ["GymnasiumVecEnv", "ScoreCallback", "load", "make_vec_env", "save", "spec_of"]
 
@@ -47,8 +45,19 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
 
         evaluate(model, spec_of(model, "MiddlePointHard-v0"))
 
-    Wrappers of Stable-Baselines3, such as `VecNormalize`, are not in a spec. ValueError if the
-    model's environments cannot be made from theirs.
+    Wrappers of Stable-Baselines3, such as `VecNormalize`, are not in a spec.
+
+    Parameters
+    ----------
+    policy
+        A model of Stable-Baselines3 with its environments.
+    env, **arguments
+        An id or a spec, and further arguments for it, as in `gymnasium.make`.
+
+    Raises
+    ------
+    ValueError
+        If the model has no environments, or if these cannot be made from their spec.
     """
     spec_of_training = _spec(policy)
     windows = plant_groups(policy.get_env())[0].parameters.windows
@@ -59,17 +68,17 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
 
 
 def _spec(model: Any) -> EnvSpec:
-    """Return the spec of the first of a model's environments, if that makes one."""
+    """Return the spec of the first of a model's environments; ValueError if it makes none."""
     spec: Any = None
     try:
         spec = model.get_env().get_attr("spec")[0]
-        # Gymnasium cannot make the Monitor that each model adds, and it changes nothing.
+        # Gymnasium cannot make the Monitor that each model adds, and a Monitor changes nothing.
         wrappers = [
             wrapper for wrapper in spec.additional_wrappers if wrapper.name != "Monitor"
         ]
         spec = dataclasses.replace(spec, additional_wrappers=tuple(wrappers))
         gymnasium.make(EnvSpec.from_json(spec.to_json()))
-    except Exception as error:  # from wrappers of anybody
+    except Exception as error:  # whatever a wrapper of another package raises
         raise ValueError(
             "policy must be a model with its environments (see mptc_gym.sb3.load), which must "
             "come from gymnasium.make or make_vec_env, in wrappers that can be imported and "
@@ -80,21 +89,21 @@ def _spec(model: Any) -> EnvSpec:
 
 
 def save(model: BaseAlgorithm, path: str | Path) -> None:
-    """Save a model atomically, with the spec of its environments.
+    """Save a model with the spec of its environments, in a zip that `load` reads.
 
-    The zip is that of `model.save` with one more member; `.zip` is added to a name without an
-    ending. ValueError if the environments differ or cannot be made from their spec, of which a
-    `VecEnvWrapper`, such as `VecNormalize`, is no part; or if the file cannot be written.
+    The zip is the zip of `model.save` with one more member. It replaces an existing file only
+    when it is complete. `.zip` is added to a name without an ending.
+
+    Raises
+    ------
+    ValueError
+        If the environments differ from each other, cannot be made from their spec, or are in a
+        `VecEnvWrapper`, such as `VecNormalize`, which is not part of a spec; or if the file
+        cannot be written.
     """
     path = _zip_path(path)
-    with _zip_of(model, path) as complete:
-        complete.replace(path)
-
-
-@contextmanager
-def _zip_of(model: BaseAlgorithm, path: Path) -> Iterator[Path]:
-    """Yield a complete zip of a model, in a new folder beside `path`, which is then deleted."""
-    spec, plants = _spec(model), cast("VecEnv", model.get_env())
+    spec = _spec(model)
+    plants = cast("VecEnv", model.get_env())
     if isinstance(plants, VecEnvWrapper) or len({*map(str, plants.get_attr("spec"))}) > 1:
         raise ValueError(
             "policy must have environments that do not differ, in no VecEnvWrapper, to be "
@@ -104,23 +113,34 @@ def _zip_of(model: BaseAlgorithm, path: Path) -> Iterator[Path]:
     algorithm = f"{type(model).__module__}:{type(model).__name__}"
     record = json.dumps({"algorithm": algorithm, "spec": spec.to_json()})
     try:
-        # A folder of its own: whatever the name, nobody else writes there.
+        # In a new folder, no other program writes to the file.
         with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
             complete = Path(folder, "model.zip")
             model.save(complete)
             with zipfile.ZipFile(complete, "a") as archive:
                 archive.writestr(MEMBER, record)
-            yield complete
+            complete.replace(path)
     except OSError as error:
         raise ValueError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
-    """Load a model that `save` wrote, with as many environments like its own.
+    """Load a model that `save` wrote, with as many environments as in its training.
 
-    Loading runs code from the zip and the modules that it names: load only what you trust.
-    `arguments` are those of the algorithm's own `load`, such as `device="cpu"`. ValueError if
-    the file is missing, is none of `save`, or cannot be loaded.
+    Loading runs code from the zip and from the modules that the zip names: load only files that
+    you trust.
+
+    Parameters
+    ----------
+    path
+        The zip; `.zip` is added to a name without an ending.
+    **arguments
+        Further arguments of the algorithm's `load`, such as `device="cpu"`.
+
+    Raises
+    ------
+    ValueError
+        If the file is missing, was not written by `save`, or cannot be loaded.
     """
     path = _zip_path(path)
     if not path.is_file():
@@ -129,23 +149,18 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
         with zipfile.ZipFile(path) as archive:
             record = json.loads(archive.read(MEMBER))
             n_envs = json.loads(archive.read("data"))["n_envs"]
-        make = partial(gymnasium.make, EnvSpec.from_json(record["spec"]))
         algorithm = pkgutil.resolve_name(record["algorithm"])
-    except Exception as error:  # of any kind, from a damaged file or the code in it
-        raise ValueError(
-            f"{path} must be a zip of mptc_gym.sb3.save; load others by their algorithm, and "
-            "say where they act: evaluate(model, env) "
-            f"({type(error).__name__}: {error})"
-        ) from error
-    try:
-        is_native = make_batch(make(), 1) is not None
-        plants: VecEnv = DummyVecEnv([make] * n_envs)
-        if is_native:
-            plants = make_vec_env(EnvSpec.from_json(record["spec"]), n_envs)
+        spec = EnvSpec.from_json(record["spec"])
+        if make_batch(gymnasium.make(spec), 1) is None:
+            plants: VecEnv = DummyVecEnv([partial(gymnasium.make, spec)] * n_envs)
+        else:
+            plants = make_vec_env(spec, n_envs)
         return cast("BaseAlgorithm", algorithm.load(path, plants, **arguments))
-    except Exception as error:  # of any kind, from an algorithm or a wrapper of anybody
+    except Exception as error:  # whatever a damaged file or the code in it raises
         raise ValueError(
-            f"{path} cannot be loaded here ({type(error).__name__}: {error})"
+            f"{path} cannot be loaded as a zip of mptc_gym.sb3.save "
+            f"({type(error).__name__}: {error}); load other zips by their algorithm, and name "
+            "the environments where they act: evaluate(model, env)"
         ) from error
 
 
@@ -156,31 +171,34 @@ def _zip_path(path: str | Path) -> Path:
 
 
 class ScoreCallback(BaseCallback):
-    """Score the policy during training, without exploration, and keep the best.
+    """Score the policy during a training, without exploration, and keep the best policy.
 
     The episodes are those of `VALIDATION_SEED`, which no published score uses. Where nothing is
-    random, as in `MiddlePoint-v0`, all are the same: select by another set point,
-    `setpoint_period=500`. The log gets `score/mean_error` and, with a bound, `score/score`.
+    random, as in `MiddlePoint-v0`, all episodes are the same: score with another set point than
+    that of published scores, such as `setpoint_period=500`. The logger of the model records
+    `score/mean_error`, degC, and, where the package has a bound, `score/score`.
 
     Parameters
     ----------
     env, **arguments
-        Where to score, as in `mptc_gym.evaluate`; it may also be the environment of the
-        training. An id or a spec takes the windows and wrappers of the training, see `spec_of`.
-        A copy of a `VecNormalize` takes its statistics.
-    every, episodes
-        Samples of experience between scores, the last at the end of training; and episodes per
-        score. Where bounds differ by episode, there are only 200 of them.
+        Where to score, as in `mptc_gym.evaluate`; `env` may also be the environment of the
+        training. An id or a spec takes the windows and wrappers of the training: see `spec_of`.
+        A copy of a `VecNormalize` takes the statistics of the training.
+    every
+        Samples of experience between two scores. The last score is at the end of the training.
+    episodes
+        Episodes of a score. Where bounds differ by episode, the package has bounds of 200
+        episodes.
     path
-        Zip in which to keep the policy with the least mean error, if any; see `save`. A file
-        that exists before the first training is not overwritten: it is a ValueError.
+        Zip in which to keep the policy with the least mean error, if any: see `save`. A
+        ValueError is raised if the file exists before the first training.
     verbose
         1 prints each score, 0 does not.
 
     Attributes
     ----------
     scores : list of (int, Evaluation)
-        Samples of experience and result of each score.
+        Samples of experience, and the result at that time, of each score.
     best : Evaluation or None
         The result with the least mean error.
     """
@@ -206,48 +224,32 @@ class ScoreCallback(BaseCallback):
         self._has_saved = False
 
     def _init_callback(self) -> None:
+        """Refuse, before a training, what would fail at the first score."""
         self._latest = self.model.num_timesteps  # of the latest score
         if self.path is not None:
             if self.path.exists() and not self._has_saved:
                 allowed = "a file that does not exist yet, as it would be overwritten"
                 reject("path", str(self.path), allowed)
-            with _zip_of(self.model, self.path):
-                pass  # it can be saved
-        self._check_environment()
+            trial = self.path.with_name(f".{uuid.uuid4().hex}.zip")
+            save(self.model, trial)
+            trial.unlink()
+        env, arguments = self._environment()
+        with opened(env, 1, self.model, **arguments) as plants:
+            check_fit(self.model, plants)
 
-    def _check_environment(self) -> None:
-        """Refuse, before the training, environments that the model cannot be scored in."""
-        if not is_environment(self._env):
-            env, arguments = self._where()
-            if isinstance(env, EnvSpec) or callable(env):
-                with opened(env, 1, **arguments) as plants:
-                    check_fit(self.model, plants)
-            return
-        copy = copied(self._env)
-        refuse_the_models_own(copy, self.model)
-        self._bring_statistics(copy.env)
-        check_fit(self.model, adapted(copy.env))
-
-    def _where(self) -> tuple[Any, dict[str, Any]]:
-        """Return where to score, and arguments for `evaluate`."""
+    def _environment(self) -> tuple[Any, dict[str, Any]]:
+        """Return where to score at present, and further arguments, for `evaluate`."""
         if isinstance(self._env, str | EnvSpec):
             return spec_of(self.model, self._env, **self._arguments), {}
         if not is_environment(self._env):
             return self._env, self._arguments
-        env = copied(self._env).env
-        self._bring_statistics(env)
+        env = Copy(self._env).env
+        pairs = zip(_normalisers(env), _normalisers(self.training_env), strict=False)
+        for of_copy, of_training in pairs:
+            of_copy.ret_rms = copy.deepcopy(of_training.ret_rms)
+            if of_training.norm_obs:
+                of_copy.obs_rms = copy.deepcopy(of_training.obs_rms)
         return env, self._arguments
-
-    def _bring_statistics(self, env: Any) -> None:
-        """Bring the statistics of the training to a copy of environments."""
-        if have_a_layer_in_common(self._env, self.training_env):
-            return  # which the copy has
-        if self.model.get_vec_normalize_env() is None or not isinstance(env, VecEnv):
-            return
-        try:
-            bring_statistics(self.training_env, env)
-        except (AssertionError, AttributeError) as error:
-            raise ValueError(f"env must be wrapped as in training: {error}") from error
 
     def _on_step(self) -> bool:
         if self.num_timesteps >= self._latest + self.every:
@@ -259,8 +261,9 @@ class ScoreCallback(BaseCallback):
             self._score()
 
     def _score(self) -> None:
+        """Score the present policy, record and print the result, and keep the best policy."""
         self._latest = self.num_timesteps
-        env, arguments = self._where()
+        env, arguments = self._environment()
         result = evaluate(
             self.model, env, episodes=self.episodes, seed=VALIDATION_SEED, **arguments
         )
@@ -278,3 +281,8 @@ class ScoreCallback(BaseCallback):
             total = self.locals.get("total_timesteps", self.num_timesteps)
             mark = "; best" if is_best else ""
             print(f"{self.num_timesteps:,} of {total:,} samples: {result}{mark}", flush=True)
+
+
+def _normalisers(env: Any) -> list[VecNormalize]:
+    """Return the layers of an environment that are a `VecNormalize`, the outermost first."""
+    return [layer for layer in layers(env) if isinstance(layer, VecNormalize)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
@@ -17,28 +17,23 @@ from mptc_gym.making import make_batch, make_one
 from mptc_gym.wrappers import IncrementalAction
 
 
-class _Part(NamedTuple):
-    """A batch and the numbers of its environments among all."""
-
-    batch: Any  # a VectorEnv
-    numbers: slice
-
-
 class GymnasiumVecEnv(VecEnv):
     """Step whole batches at once, where `DummyVecEnv` steps one environment after another.
 
-    All that it returns is bit for bit that of `DummyVecEnv` with the same environments, except
-    for infos: `step` lists only those of last samples, as dicts would take longer than the
-    step, and `infos` holds the latest of all in Gymnasium's form, as arrays.
+    All that it returns is bit for bit that of `DummyVecEnv` with the same environments, each in
+    a `Monitor`, except for infos: `step` fills the infos of an environment only where its
+    episode ends, as making all these dicts would take longer than the step. The attribute
+    `infos` holds the infos of all environments in Gymnasium's form, as arrays.
 
     Parameters
     ----------
-    batches
-        Vector environments of autoreset mode "SameStep" and with the same spaces; their
+    *batches
+        Vector environments of autoreset mode "SameStep" and with the same spaces. Their
         environments are numbered one batch after another.
-    spec, group
-        Spec of one environment with its wrappers, if all are alike; and number of neighbours
-        that share a seed, and thus all random numbers.
+    spec
+        The spec of one environment with its wrappers, if all environments are alike.
+    group
+        Number of neighbouring environments that share a seed, and thus all random numbers.
     """
 
     def __init__(
@@ -47,47 +42,49 @@ class GymnasiumVecEnv(VecEnv):
         modes = {batch.metadata.get("autoreset_mode") for batch in batches}
         if modes != {AutoresetMode.SAME_STEP}:
             raise ValueError(f"batches must have autoreset_mode 'SameStep', got {modes}")
-        self.batches = batches
+        self.batches: tuple[Any, ...] = batches
         self.spec = spec
         self.group = group
         self.infos: dict[str, Any] = {}
-        self._parts: list[_Part] = []
+        self._slices: list[slice] = []  # the numbers of the environments of each batch
         num_envs = 0
         for batch in batches:
-            numbers = slice(num_envs, num_envs + batch.num_envs)
-            self._parts.append(_Part(batch, numbers))
+            self._slices.append(slice(num_envs, num_envs + batch.num_envs))
             num_envs += batch.num_envs
         self._next_seeds: list[int | None] = [None] * num_envs
         self._returns = np.zeros(num_envs)  # of the episode so far
-        self._lengths = np.zeros(num_envs, np.int64)
-        spaces = batches[0].single_observation_space, batches[0].single_action_space
-        super().__init__(num_envs, *spaces)
+        self._lengths = np.zeros(num_envs, np.int64)  # of the episode so far, samples
+        super().__init__(
+            num_envs, batches[0].single_observation_space, batches[0].single_action_space
+        )
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seeds of the next reset: environment i has `seed + i // group`."""
-        first = cast("int", super().seed(seed)[0])  # a random one if there is none
+        first = cast("int", super().seed(seed)[0])  # a random seed if `seed` is None
         seeds = [first + index // self.group for index in range(self.num_envs)]
         self.set_seeds(seeds)
         return seeds
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
-        """Set the seeds of the next reset, one per environment."""
+        """Set the seeds of the next reset, one for each environment."""
         self._next_seeds = [*seeds]
 
     def reset(self) -> NDArray[Any]:
-        """Reset all environments, with the seeds set by `seed`."""
+        """Reset all environments, with the seeds set by `seed` or `set_seeds`."""
         returned = [
-            part.batch.reset(seed=self._next_seeds[part.numbers]) for part in self._parts
+            batch.reset(seed=self._next_seeds[numbers])
+            for batch, numbers in zip(self.batches, self._slices, strict=True)
         ]
         self._next_seeds = [None] * self.num_envs
         self._returns[:] = 0.0
         self._lengths[:] = 0
+        observations, infos = zip(*returned, strict=True)
+        self.infos = _joined(infos)
         self.reset_infos = []
-        for part, (_, infos) in zip(self._parts, returned, strict=True):
-            self.reset_infos += [_infos_of_one(infos, i) for i in range(part.batch.num_envs)]
-        joined = _joined(returned)
-        self.infos = joined[-1]
-        return cast("NDArray[Any]", joined[0])
+        for infos_of_batch, batch in zip(infos, self.batches, strict=True):
+            rows = range(batch.num_envs)
+            self.reset_infos += [_infos_of_one(infos_of_batch, row) for row in rows]
+        return np.concatenate(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Store the actions, shape (num_envs, action size)."""
@@ -95,34 +92,39 @@ class GymnasiumVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step with the stored actions."""
-        returned = [part.batch.step(self._actions[part.numbers]) for part in self._parts]
-        observations, rewards, terminated, truncated, self.infos = _joined(returned)
+        returned = [
+            batch.step(self._actions[numbers])
+            for batch, numbers in zip(self.batches, self._slices, strict=True)
+        ]
+        *arrays, batch_infos = zip(*returned, strict=True)
+        observations, rewards, terminated, truncated = map(np.concatenate, arrays)
+        self.infos = _joined(batch_infos)
         ended = terminated | truncated
         self._returns += rewards
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in ended]
-        for index in np.flatnonzero(ended).tolist():
-            place = self._place(index)
-            infos_of_batch = returned[place.part][-1]
-            infos[index] = {
-                **_infos_of_one(infos_of_batch["final_info"], place.row),
-                "terminal_observation": infos_of_batch["final_obs"][place.row],
-                "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
-                "episode": {
-                    "r": self._returns[index].item(),
-                    "l": self._lengths[index].item(),
-                },
-            }
-            self.reset_infos[index] = _infos_of_one(infos_of_batch, place.row)
+        for infos_of_batch, numbers in zip(batch_infos, self._slices, strict=True):
+            for row in np.flatnonzero(ended[numbers]).tolist():
+                index = numbers.start + row
+                infos[index] = {
+                    **_infos_of_one(infos_of_batch["final_info"], row),
+                    "terminal_observation": infos_of_batch["final_obs"][row],
+                    "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
+                    "episode": {
+                        "r": self._returns[index].item(),
+                        "l": self._lengths[index].item(),
+                    },
+                }
+                self.reset_infos[index] = _infos_of_one(infos_of_batch, row)
         self._returns[ended] = 0.0
         self._lengths[ended] = 0
         return observations, rewards.astype(np.float32), ended, infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
-        """Return a picture of each environment, if the batch has the mode "rgb_array"."""
+        """Return a picture of each environment, if the batches render."""
         images: list[NDArray[np.uint8]] = []
         for batch in self.batches:
-            images += cast("Any", batch.render() or ())
+            images += batch.render() or ()
         return images
 
     def close(self) -> None:
@@ -132,13 +134,15 @@ class GymnasiumVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of each environment's batch, or the spec of one environment."""
-        places = [self._place(index) for index in self._get_indices(indices)]
-        if attr_name == "spec":
-            return [self.spec for _ in places]
-        return [getattr(self.batches[place.part], attr_name) for place in places]
+        values = [self.spec] * self.num_envs
+        if attr_name != "spec":
+            values = []
+            for batch in self.batches:
+                values += [getattr(batch, attr_name)] * batch.num_envs
+        return [values[index] for index in self._get_indices(indices)]
 
     def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
-        """Refuse: an environment of a batch has no methods or attributes of its own."""
+        """Refuse: an environment of a batch has no methods or attributes for itself."""
         raise NotImplementedError(f"use `batches`, for all at once, got {args or kwargs}")
 
     set_attr = env_method
@@ -149,40 +153,24 @@ class GymnasiumVecEnv(VecEnv):
         """Return False for each index: a batch holds no wrapped environments."""
         return [False for _ in self._get_indices(indices)]
 
-    def _place(self, index: int) -> _Place:
-        """Return where an environment is."""
-        for number, part in enumerate(self._parts):
-            if index < part.numbers.stop:
-                return _Place(number, index - part.numbers.start)
-        raise IndexError(index)
+
+def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
+    """Concatenate the arrays in the infos of batches that all batches have, by name."""
+    common_names = set(infos[0]).intersection(*infos[1:])
+    joined = {}
+    for name, values in infos[0].items():
+        if name in common_names and isinstance(values, np.ndarray):
+            joined[name] = np.concatenate([of_batch[name] for of_batch in infos])
+    return joined
 
 
-class _Place(NamedTuple):
-    """Where an environment is: the number of its part, and its row there."""
-
-    part: int
-    row: int
-
-
-def _joined(returned: list[tuple[Any, ...]]) -> list[Any]:
-    """Concatenate what the batches returned: their arrays, and their infos by name."""
-    *arrays, infos = zip(*returned, strict=True)
-    names = set.intersection(*map(set, infos))
-    columns = {
-        name: np.concatenate([infos_of_batch[name] for infos_of_batch in infos])
-        for name in names
-        if isinstance(infos[0][name], np.ndarray)
-    }
-    return [*map(np.concatenate, arrays), columns]
-
-
-def _infos_of_one(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Return the infos of one environment of a batch, as it would return them alone."""
+def _infos_of_one(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
+    """Return the infos of one environment of a batch, as the environment alone returns them."""
     infos_of_one = {}
     for name, values in infos.items():
         is_of_plant = not name.startswith("final_") and f"_{name}" in infos
-        if is_of_plant and infos[f"_{name}"][index]:
-            value = values[index]
+        if is_of_plant and infos[f"_{name}"][row]:
+            value = values[row]
             infos_of_one[name] = value.item() if isinstance(value, np.generic) else value
     return infos_of_one
 
@@ -201,19 +189,24 @@ def make_vec_env(
     Parameters
     ----------
     env, **arguments
-        An id or an `EnvSpec`, and further arguments for it, as in `gymnasium.make`;
+        An id or an `EnvSpec`, and further arguments for it, as in `gymnasium.make`.
         `render_mode` may be "rgb_array".
     n_envs
         Number of plants.
     seed
         Seed of the first plant at the first reset; plant i has `seed + i // group`. The seed of
-        a model, if it has one, replaces it.
+        a model, if it has one, replaces this seed.
     group
         Number of neighbouring plants that share a seed: they have the same noise, load and
-        set points, and differ only in what a policy explores.
+        set points, and differ only in the actions that a policy explores.
     wrapper
-        Adds `IncrementalAction`: its arguments, or the class itself for its defaults. Others
-        cannot take a batch: use `stable_baselines3.common.env_util.make_vec_env`.
+        Adds `IncrementalAction`: its arguments, or the class itself for its defaults. Other
+        wrappers cannot take a batch: use `stable_baselines3.common.env_util.make_vec_env`.
+
+    Raises
+    ------
+    ValueError
+        If `env` is not of this package, or an argument is out of range.
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
@@ -221,10 +214,8 @@ def make_vec_env(
     single = make_one(env, arguments)
     if isinstance(wrapper, Mapping):
         single = IncrementalAction(single, **wrapper)
-    elif callable(wrapper):
-        single = wrapper(single)
     elif wrapper is not None:
-        reject("wrapper", wrapper, "the arguments of IncrementalAction, or the class itself")
+        single = wrapper(single)
     mode = AutoresetMode.SAME_STEP
     batch = make_batch(single, n_envs, autoreset_mode=mode, render_mode=render_mode)
     if batch is None:

@@ -139,7 +139,7 @@ class TestOwnControllers:
             ),
             ("class Mine: __init__ = lambda self, gain: None", "argument: 'gain'"),
             (
-                "from mptc_gym import MiddlePointEnv as E\ndef Mine(): return dict, E",
+                "from mptc_gym import MiddlePointEnv as E\ndef Mine(): return (lambda o: o), E",
                 "must have the parameters of the case",
             ),
         ],
@@ -225,7 +225,7 @@ class TestSavedPolicies:
     @pytest.mark.parametrize(
         ("location", "complaint"),
         [
-            ("PPO:{}/wide.zip", "env must have the same observation space as in the training"),
+            ("PPO:{}/wide.zip", "observation space of policy's training"),
             ("No:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("SAC:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("PPO:{}/nan.zip", "Expected parameter loc"),

@@ -187,11 +187,6 @@ class Acting(Network):
         return self(torch.as_tensor(observations))
 
 
-class TensorAct(Network):
-    def act(self, observations):
-        return self(observations)
-
-
 class Exploration(Network):
     """A module whose noise depends on its mode, by a `train` of its own."""
 
@@ -389,6 +384,8 @@ RIGHT = {
     "one environment": lambda _: memory(made()),
     "drawn limits": lambda _: memory(make := partial(
         made, u_min=[-12.0, -8.0], u_max=[8.0, 12.0]), make),
+    "wrapper that returns tensors": lambda _: plain(
+        law, wrappers.TransformObservation(made(), torch.as_tensor, None)),
     "one in mid-episode": lambda _: memory(halfway(made())),
     "native batch": lambda _: memory(many()),
     "native batch, SameStep": lambda _: memory(many(autoreset_mode="SameStep")),
@@ -475,32 +472,20 @@ REFUSED = {
     "controller of too few loops": (
         lambda: (DirectNNController(num_envs=2), NOISY), "num_envs=3"),
     "unknown id": (
-        lambda: (law, "MiddlePointNosy-v0"), r"id of an env.*did you mean MiddlePointNoisy-v0"),
+        lambda: (law, "MiddlePointNosy-v0"), r"id of an env.*Did you mean: .MiddlePointNoisy"),
     "another environment": (lambda: (law, "CartPole-v1"), "of MiddlePointEnv .*CartPole-v1"),
-    "module without forward": (lambda: (torch.nn.Module(), NOISY), "as agent.actor_mean"),
     "tuple of actions and more": (
         lambda: (lambda seen: (law(seen), None), NOISY),
         r"returns actions alone, such as lambda o: agent\.get_action\(o\)\[0\]"),
-    "predict that returns three things": (
-        lambda: (SimpleNamespace(predict=lambda seen: (law(seen), None, None)), NOISY),
-        "policy.predict must be a method that returns actions, or actions and a state"),
     "swapped arguments": (lambda: (made(), law), r"which comes first: evaluate\(policy, env\)"),
-    "reset with arguments": (
-        lambda: (SimpleNamespace(act=law, reset=lambda env: None), NOISY),
-        "reset must be callable without arguments, .* lambda o: agent.act"),
-    "module whose act takes tensors": (
-        lambda: (TensorAct(), NOISY), r"take NumPy arrays, .*act\(torch\.as_tensor\(o\)\)"),
-    "tensors in place of arrays": (
-        lambda: (law, wrappers.TransformObservation(made(), torch.as_tensor, None)),
-        "in NumPy, without .* NumpyToTorch"),
     "environment in PyTorch": (
-        lambda: (law, MiddlePointTorchEnv(N)), "in NumPy, such as one of the same id or spec"),
+        lambda: (law, MiddlePointTorchEnv(N)), "of MiddlePointEnv in NumPy, and open, such as"),
     "no environment": (lambda: (law, 7), "env must be an id, an EnvSpec, environments, or a f"),
     "function that makes a batch": (lambda: (law, many), "where it makes many, call it"),
     "function that makes the same": (
-        lambda: (law, lambda e=made(): e), "makes another environment in each call"),  # noqa: B008
+        lambda: (law, lambda e=made(): e), "run the episodes of its seeds"),  # noqa: B008
     "another seed": (
-        lambda: (law, odd(reset=lambda env, seed: env.reset(seed=5))),
+        lambda: (law, odd(reset=lambda env, seed, options: env.reset(seed=5))),
         "of its seeds, whose noise at sample"),
     "flattering errors": (
         lambda: (law, telling(lambda info: info | {"error": 0.1})),
@@ -517,27 +502,27 @@ REFUSED = {
             *(found := env.step(action))[:2], found[4]["error"] > 6.5, *found[3:]))),
         "all episodes at once"),
     "VecNormalize without statistics": (
-        lambda: (law, VecNormalize(dummy())), "in VecNormalize, which has seen nothing"),
+        lambda: (law, VecNormalize(dummy())), "in VecNormalize, got initial"),
     "new NormalizeObservation": (
         lambda: (law, wrappers.NormalizeObservation(made())),
-        "NormalizeObservation, which has seen noth"),
+        "in NormalizeObservation, got initial"),
     "normalised in one of the processes": (
         lambda: (law, AsyncVectorEnv(
             [made, lambda: wrappers.NormalizeReward(made())], context="fork")),
         "not normalise in other processes"),
-    "closed processes": (lambda: (law, closed(processes())), "an open environment"),
+    "closed processes": (lambda: (law, closed(processes())), "in NumPy, and open"),
     "Monitor in mid-episode": (
         lambda: (law, halfway(Monitor(made(), allow_early_resets=False))),
         "allow_early_resets=T"),
     "model of other windows": (
         lambda: (model_of(PPO, made(action_window=3)), NOISY),
-        r"windows of .* \(3, 3, 0, 3\), got .*model\.get_env\(\)\), or spec_of\(model"),
+        r"windows .* \(3, 3, 0, 3\), got \(3, 3, 0, 0\): .*model\.get_env\(\)\), or spec_of"),
     "the same, without environments": (
         lambda: (model_of(PPO, made(action_window=3)).policy, NOISY),
-        r"space as in the training of policy, shape \(9,\) within .* got shape \(6,\)"),
+        r"observation space of policy's training, shape \(9,\) within .* got shape \(6,\)"),
     "model of windows with these bounds": (
         lambda: (model_of(PPO, made(error_window=0, output_window=3)),
-                 made(setpoint_window=6, error_window=0)), "windows of policy's training"),
+                 made(setpoint_window=6, error_window=0)), "windows .* of policy's training"),
     "model whose IncrementalAction is forgotten": (
         lambda: (model_of(PPO, make_vec_env(NOISY, N, wrapper=VELOCITY)), NOISY),
         "wrappers of policy's training, IncrementalAction.*, got none"),
@@ -773,6 +758,13 @@ class TestWhatCannotBeCopied:
                 seeds = [env.unwrapped.np_random_seed]
                 env.step(np.zeros(1, np.float32))
             assert not {*seeds} & {*range(SEED, SEED + 9)}
+
+    def test_a_model_of_other_processes_may_act_in_this_one(self):
+        with closing(processes(lambda: moved(made()))) as training:
+            model = model_of(PPO, training)
+            found = evaluate(model, lambda: moved(made()), episodes=EPISODES)
+        expected = errors_of(predicting(model), lambda: moved(made()))
+        np.testing.assert_allclose(found.errors, expected, rtol=0, atol=1e-6)
 
     def test_it_is_refused_without_harm_where_a_model_trains_in_it(self):
         model = model_of(PPO, VecNormalize(processes()))

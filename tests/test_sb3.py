@@ -118,7 +118,6 @@ class TestBatches:
             "group must be an integer from 1": {"group": 2},
             "env must be of this pack": {"env": DelayObservation(one(), delay=2).spec},
             "max_move must be": {"wrapper": {"max_move": 7}},
-            "wrapper must be the arguments": {"wrapper": 5},
             "env must be the id of an environment": {"env": "Point-v0"},
         }.items():
             with pytest.raises(ValueError, match=message):
@@ -184,11 +183,8 @@ class TestZips:
         for edited, message in (
             ("{}", "KeyError"),
             (record.replace("PPO", "PPOO"), "AttributeError"),
-            (
-                record.replace("MiddlePointEnv", "Nothing"),
-                "cannot be loaded here .AttributeErr",
-            ),
-            (None, "must be a zip of mptc_gym.sb3.save; load others by"),
+            (record.replace("MiddlePointEnv", "Nothing"), "save .AttributeErr.*Nothing"),
+            (None, "cannot be loaded as a zip of mptc_gym.sb3.save .*; load other zips by"),
         ):
             model.save(file)
             if edited:
@@ -198,7 +194,7 @@ class TestZips:
                 load(file)
         save(model, file)
         file.write_bytes(file.read_bytes()[:500])
-        with pytest.raises(ValueError, match="must be a zip of mptc_gym"):
+        with pytest.raises(ValueError, match="cannot be loaded as a zip of mptc_gym"):
             load(file)
         with pytest.raises(ValueError, match=r"path must be an existing file, .*none\.zip"):
             load(tmp_path / "none.zip")
@@ -213,7 +209,7 @@ def test_spec_of_a_model_has_its_windows_and_wrappers():
         parameters = env.unwrapped.parameters
         assert (parameters.action_window, parameters.output_window) == (20, 0)
         assert (parameters.delay, parameters.setpoint) == (3, "random")
-    with pytest.raises(ValueError, match="windows of policy's training"):
+    with pytest.raises(ValueError, match=r"windows .* of policy's training"):
         evaluate(model, spec_of(model, HARD, action_window=3))
     with pytest.raises(ValueError, match="must be a model with its env"):
         spec_of(model.policy)
@@ -300,7 +296,7 @@ class TestScoreCallback:
         model = model_of(VecNormalize(make_vec_env()))
         for env, message in (
             (model.get_env().venv, "wrappers of policy's training, VecNormalize, got none"),
-            (make_vec_env(), "must be wrapped as in training"),
+            (make_vec_env(), "wrappers of policy's training, VecNormalize, got none"),
             ("MiddlePoint-v0", "wrappers of policy's training, VecNormalize"),
             (one, "wrappers of policy's training, VecNormalize"),
         ):

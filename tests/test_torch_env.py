@@ -322,7 +322,7 @@ class TestById:
     @pytest.mark.parametrize(
         ("env", "named"),
         [
-            ("MiddlePointHart-v0", "did you mean MiddlePointHard-v0"),
+            ("MiddlePointHart-v0", "Did you mean: .MiddlePointHard"),
             ("CartPole-v1", "spec of a MiddlePointEnv, without wrappers"),
             (IncrementalAction(gymnasium.make("MiddlePoint-v0")).spec, "without wrappers"),
         ],

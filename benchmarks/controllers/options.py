@@ -22,10 +22,11 @@ from benchmarks.controllers.spec import EVERYTHING, LIMITS, ControllerSpec
 from benchmarks.lib.command import FanOut, Names, Parameter, blame, known, options
 from benchmarks.lib.errors import UsageError
 from mptc_gym import IDS, Parameters
-from mptc_gym.acting import opened
 from mptc_gym.evaluation import case_of
-from mptc_gym.fit import check_fit
-from mptc_gym.policies import start
+from mptc_gym.layers import plant_groups
+from mptc_gym.scoring.fit import check_fit
+from mptc_gym.scoring.opening import opened
+from mptc_gym.scoring.policies import start
 
 AgentNames = Annotated[Names, Parameter(help=f"Controllers to run, of {', '.join(ROSTER)}.")]
 FORMS = (
@@ -238,7 +239,7 @@ class Policy:
         with opened(env, self.runs, self.policy, **more) as given:
             with blame("--agent"):
                 case = case_of(Parameters(**arguments))
-                if any(case_of(group.parameters) != case for group in given.groups):
+                if any(case_of(group.parameters) != case for group in plant_groups(given)):
                     raise ValueError("the environment must have the parameters of the case")
                 check_fit(self.policy, given)
             yield given

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
-from mptc_gym.acting import rollout as run_batch
-from mptc_gym.adapters import Plants, adapted
 from mptc_gym.draws import Ranges
 from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.plant import action_from_command, least_effective
+from mptc_gym.scoring.rollout import rollout as run_batch
 
 Array = NDArray[np.float64]
 
@@ -113,7 +112,7 @@ def rollout(
     Parameters
     ----------
     plants
-        A vector environment, or environments as `mptc_gym.acting` opens them.
+        A vector environment.
     agent
         The controller.
     samples
@@ -126,8 +125,7 @@ def rollout(
     seeds = [*range(seed, seed + plants.num_envs)]
     agent.reset()
     act = partial(_watched, before, itertools.count(), agent.act) if before else agent.act
-    adapted_plants = plants if isinstance(plants, Plants) else adapted(plants)
-    signals, steps = [], run_batch(adapted_plants, act, samples, seeds)
+    signals, steps = [], run_batch(plants, act, samples, seeds)
     for (_, info, _), (_, next_info, _) in itertools.pairwise(steps):
         # A step reports the command and the applied flow of the sample at which it starts.
         sample = [

@@ -1,6 +1,6 @@
 """Wrap an environment so that the action changes the flow instead of setting it.
 
-`mptc_gym.wrappers.vector` does so for vector environments.
+`mptc_gym.wrappers.vector` has the same wrapper for vector environments.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mptc_gym.checks import is_number, one_action, reject
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import action_from_command, float32_action
 
-NUMBERS = "dead_zone", "u_min", "u_max"  # parameters of an actuator
+NUMBERS = "dead_zone", "u_min", "u_max"  # the arguments of the plant that an actuator has, t/h
 
 
 class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructorArgs):
@@ -29,8 +29,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 
         v(k) = v(k-1) + w(k) max_move (u_max - u_min) / 2,   limited to [u_min, u_max]
 
-    and the command is u(k) = v(k). This spares the valve, and makes exploration effective, as
-    changes last.
+    and the command is u(k) = v(k). The velocity form spares the valve, and makes exploration
+    effective, as each change of the flow lasts.
 
     With `compensate_dead_zone`, the command skips the dead zone, of half width z::
 
@@ -38,14 +38,14 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         v = 0:   u =  0
         v < 0:   u = -z + (u_min + z) v / u_min
 
-    Then every change of v has an effect, and every flow that the actuator can apply can still
-    be reached. The command stays 0 from `reset` until the first nonzero action.
+    With compensation, every change of v has an effect, and v reaches every flow that the
+    actuator can apply. The command stays 0 from `reset` until the first nonzero action.
 
     The action space is `Box(-1, 1, (1,), float32)`; actions beyond it are clipped. Observation,
     reward (with `move_weight`) and info are those of the environment, which receives absolute
-    actions. A policy must know v, which the newest action in `action_window` shows: with the
-    nominal delay, `action_window=20` makes the noise-free problem Markov while the set point
-    holds.
+    actions. A policy must know v, which follows from the newest action in `action_window`. With
+    the nominal delay, `action_window=20` makes the noise-free problem Markov while the set
+    point holds.
 
     Parameters
     ----------
@@ -54,8 +54,9 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     max_move
         Change of the wanted flow by an action of 1, as a share of half the range, up to 2.
     compensate_dead_zone
-        False leaves the dead zone as it is. True compensates the plant's own, as drawn for the
-        episode where it is a range. A number compensates a dead zone of that half width, t/h.
+        False leaves the dead zone as it is. True compensates the dead zone of the plant, as
+        drawn for the episode if `dead_zone` is a range. A number compensates a dead zone with
+        this half width, t/h.
 
     Attributes
     ----------
@@ -65,8 +66,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     Raises
     ------
     ValueError
-        If an argument is out of range; from `step`, if the action is not one finite number.
-        The wrapper and the environment are then unchanged.
+        If an argument is out of range; from `step`, if the action is not one finite number. A
+        `step` that raises this error leaves the wrapper and the environment unchanged.
 
     Examples
     --------
@@ -95,30 +96,46 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         self.increments = max_move, compensate_dead_zone
         self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}
         self._actuator = Actuator(self._numbers, *self.increments)
-        self._flow = 0.0  # wanted, t/h
+        self._flow = 0.0  # v, t/h
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment, and set the wanted flow to 0."""
+        """Reset the environment, and set the wanted flow v to 0."""
         observation, info = self.env.reset(seed=seed, options=options)
-        numbers = self._numbers | {name: info[name] for name in NUMBERS if name in info}
-        self._actuator, self._flow = Actuator(numbers, *self.increments), 0.0
+        drawn_numbers = {name: info[name] for name in NUMBERS if name in info}
+        self._actuator = Actuator(self._numbers | drawn_numbers, *self.increments)
+        self._flow = 0.0
         return observation, info
+
+    def __str__(self) -> str:
+        return f"<{type(self).__name__}{self.increments}{self.env}>"
 
     def action(self, action: Any) -> NDArray[np.float32]:
         """Move the wanted flow by an action, shape (1,), and return the absolute action."""
-        move, actuator = one_action(action), self._actuator
-        flow = self._flow + actuator.move * max(-1.0, min(1.0, move))
+        move = max(-1.0, min(1.0, one_action(action)))
+        actuator = self._actuator
+        flow = self._flow + actuator.move * move
         self._flow = max(actuator.u_min, min(actuator.u_max, flow))
         return np.array([actuator.action(self._flow)], np.float32)
 
 
 class Actuator:
-    """An actuator as the wrappers know it, and the actions that make it apply a flow.
+    """What the wrappers know of an actuator, to find the actions that make it apply a flow.
 
-    `numbers` are its `dead_zone`, `u_min` and `u_max`, t/h: floats, or arrays for many plants.
-    The other arguments are those of the wrappers; ValueError if one is out of range.
+    The numbers are floats for one plant, or arrays of shape (n,) for n plants.
+
+    Parameters
+    ----------
+    numbers
+        `dead_zone`, `u_min` and `u_max`, t/h, by name.
+    max_move, compensate_dead_zone
+        The arguments of the wrappers.
+
+    Raises
+    ------
+    ValueError
+        If `max_move` or `compensate_dead_zone` is out of range.
     """
 
     def __init__(
@@ -126,22 +143,30 @@ class Actuator:
     ) -> None:
         if not is_number(max_move) or not 0.0 < max_move <= 2.0:
             reject("max_move", max_move, "a number above 0, up to 2")
-        own, self.u_min, self.u_max = (numbers[name] for name in NUMBERS)
-        self.move = max_move * ((self.u_max - self.u_min) / 2.0)  # by an action of 1, t/h
-        self._compensates = compensate_dead_zone is not False
-        self._zone = zone = own if compensate_dead_zone is True else compensate_dead_zone
-        if not isinstance(compensate_dead_zone, bool) and not (is_number(zone) and zone >= 0.0):
+        zone = compensate_dead_zone
+        if not isinstance(zone, bool) and not (is_number(zone) and zone >= 0.0):
             reject("compensate_dead_zone", zone, "True, False or a number from 0 to 1e9")
-        # A limit inside the dead zone is reached by commanding the edge, which (29) limits.
-        self._above, self._below = (
-            np.maximum(limit - zone, 0.0) / np.where(limit > 0.0, limit, 1.0)
-            for limit in (self.u_max, -self.u_min)
-        )
+        self.u_min = numbers["u_min"]
+        self.u_max = numbers["u_max"]
+        self.move = max_move * ((self.u_max - self.u_min) / 2.0)  # by an action of 1, t/h
+        self._compensates = zone is not False
+        # The half width of the zone that is skipped, t/h.
+        self._zone: Any = numbers["dead_zone"] if zone is True else zone
+        self._slope_above = self._slope(self.u_max)
+        self._slope_below = self._slope(-self.u_min)
+
+    def _slope(self, limit: Any) -> Any:
+        """Return the change of the command for a change of the flow by 1, up to a limit, t/h.
+
+        The slope is 0 for a limit inside the dead zone: (29) limits a command on the edge of
+        the zone to this limit.
+        """
+        return np.maximum(limit - self._zone, 0.0) / np.where(limit > 0.0, limit, 1.0)
 
     def action(self, flow: Any) -> Any:
         """Return the environment's action for a wanted flow in t/h, a float or an array."""
         if not self._compensates:
             return action_from_command(flow, self.u_min, self.u_max)
-        above = (flow > 0.0) * (self._zone + self._above * flow)
-        below = (flow < 0.0) * (self._zone - self._below * flow)
+        above = (flow > 0.0) * (self._zone + self._slope_above * flow)
+        below = (flow < 0.0) * (self._zone - self._slope_below * flow)
         return float32_action(above - below, self.u_min, self.u_max, self._zone)

@@ -1,4 +1,4 @@
-"""Wrap many environments at once so that actions change the flow instead of setting it."""
+"""Wrap a vector environment so that actions change the flow instead of setting it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,23 @@ from mptc_gym.wrappers import NUMBERS, Actuator
 class IncrementalAction(VectorActionWrapper):
     """The action changes the flow: `mptc_gym.wrappers.IncrementalAction` for many plants.
 
-    Every plant has its own wanted flow. Everything that `reset` and `step` return equals what
-    the same number of single wrapped environments return.
+    The wrapper keeps a wanted flow for each plant. All that `reset` and `step` return equals
+    what the same number of single wrapped environments return. All three autoreset modes and
+    partial resets work.
 
-    `env` is a `MiddlePointVectorEnv`, or another vector environment of `MiddlePointEnv` in
-    NumPy, such as Gymnasium's `SyncVectorEnv`. All three autoreset modes and partial resets
-    work. Arguments and errors are those of the wrapper of one environment; `step` also raises a
-    ValueError if the shape of the actions is not (num_envs, 1).
+    Parameters
+    ----------
+    env
+        A `MiddlePointVectorEnv`, or another vector environment of `MiddlePointEnv` in NumPy,
+        such as Gymnasium's `SyncVectorEnv`.
+    max_move, compensate_dead_zone
+        The arguments of `mptc_gym.wrappers.IncrementalAction`.
+
+    Raises
+    ------
+    ValueError
+        If `env` is of another kind or an argument is out of range; from `step`, if actions are
+        not finite numbers, shape (num_envs, 1).
     """
 
     def __init__(
@@ -50,15 +60,18 @@ class IncrementalAction(VectorActionWrapper):
             self._numbers[name] = np.repeat(lowest, counts)
         self._actuator = Actuator(self._numbers, *self.increments)
         self._mode = AutoresetMode(env.metadata["autoreset_mode"])
-        self._flows = np.zeros(self.num_envs)  # wanted, t/h
-        self._ended = np.zeros(self.num_envs, np.bool_)  # to be reset by the next step
+        self._flows = np.zeros(self.num_envs)  # wanted flows v, t/h
+        # The plants whose episode has ended, and that the next step resets.
+        self._ended = np.zeros(self.num_envs, np.bool_)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
         """Reset all environments, or those of `reset_mask`, and their wanted flows to 0."""
-        # Read first, as Gymnasium's own environments remove it from the options.
+        # Read first, as Gymnasium's vector environments remove the mask from the options.
         mask = options.get("reset_mask") if isinstance(options, Mapping) else None
+        if mask is None:
+            mask = np.ones(self.num_envs, np.bool_)
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._begin(np.ones(self.num_envs, np.bool_) if mask is None else mask, infos)
+        self._begin_episodes(mask, infos)
         return observations, infos
 
     def step(self, actions: Any) -> Any:
@@ -67,21 +80,25 @@ class IncrementalAction(VectorActionWrapper):
         actuator = self._actuator
         flows = self._flows + actuator.move * moves.clip(-1.0, 1.0)
         flows = flows.clip(actuator.u_min, actuator.u_max)
-        returned = self.env.step(actuator.action(flows).astype(np.float32)[:, np.newaxis])
+        absolute_actions = actuator.action(flows).astype(np.float32)[:, np.newaxis]
+        returned = self.env.step(absolute_actions)
         _, _, terminations, truncations, infos = returned
         self._flows = flows
         ended = terminations | truncations
-        begun = ended if self._mode is AutoresetMode.SAME_STEP else self._ended.copy()
-        if begun.any():
-            self._begin(begun, infos)
+        begins = ended if self._mode is AutoresetMode.SAME_STEP else self._ended.copy()
+        if begins.any():
+            self._begin_episodes(begins, infos)
         if self._mode is AutoresetMode.NEXT_STEP:
             self._ended = ended
         return returned
 
-    def _begin(self, begun: NDArray[np.bool_], infos: dict[str, Any]) -> None:
-        """Set the wanted flow to 0 where an episode has begun, and store what was drawn."""
+    def _begin_episodes(self, begins: NDArray[np.bool_], infos: dict[str, Any]) -> None:
+        """Set wanted flows to 0, and take the numbers of the actuator from infos.
+
+        `begins` says of which plants an episode begins, shape (num_envs,).
+        """
         for name in {*NUMBERS} & {*infos}:
-            self._numbers[name][begun] = infos[name][begun]
+            self._numbers[name][begins] = infos[name][begins]
         self._actuator = Actuator(self._numbers, *self.increments)
-        self._flows[begun] = 0.0
-        self._ended = self._ended & ~begun
+        self._flows[begins] = 0.0
+        self._ended = self._ended & ~begins

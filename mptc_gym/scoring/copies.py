@@ -1,0 +1,131 @@
+"""Copy environments layer by layer, so that a policy can act in a copy.
+
+`copy.deepcopy` alone is not enough. It fails for files and for most wrappers of
+Stable-Baselines3, loses what a `VecNormalize` wraps, and closes the pipes of environments in
+other processes.
+"""
+
+from __future__ import annotations
+
+import copy
+import copyreg
+from multiprocessing import connection
+from typing import Any, Final, NoReturn
+
+from gymnasium.vector import VectorEnv
+
+from mptc_gym.layers import INNER, VEC_ENV, inner_environments, layers, loaded, runs_processes
+
+# Layers that record episodes and change nothing: a copy is made without these layers.
+_RECORDERS: Final = (
+    "gymnasium.wrappers.RecordVideo",
+    "gymnasium.wrappers.vector.RecordVideo",
+    "minari.DataCollector",
+    f"{VEC_ENV}.VecVideoRecorder",
+)
+# The ends of pipes; on Windows, some are of a class that other systems do not have.
+_PIPES: Final[tuple[Any, ...]] = (
+    connection.Connection,
+    getattr(connection, "PipeConnection", connection.Connection),
+)
+
+
+class Copy:
+    """A copy of an environment and of all that it wraps, also in mid-episode.
+
+    The original stays as it is. The copy writes to no file of the original, and closes nothing.
+    The copy shares layers with the original that run in other processes, show a window, hold a
+    pipe, or cannot be copied for another reason.
+
+    Parameters
+    ----------
+    env
+        An environment of any kind.
+
+    Attributes
+    ----------
+    env : environment
+        The copy.
+    shared : dict of int to environment
+        The layers of the original that the copy shares, by `id`.
+    reason : str
+        Why a layer cannot be copied; "" if all layers were copied.
+    """
+
+    def __init__(self, env: Any) -> None:
+        for pipe in _PIPES:
+            copyreg.pickle(pipe, _refuse_pipe)
+        self.shared: dict[int, Any] = {}
+        self.reason = ""
+        self._memo: dict[int, Any] = {}  # of `copy.deepcopy`: copies by the `id` of originals
+        self.env = self._copy(env)
+
+    def _copy(self, layer: Any) -> Any:
+        """Return a copy of a layer and of the layers within it, or else the layer itself."""
+        if id(layer) in self._memo:
+            return self._memo[id(layer)]
+        for inner in inner_environments(layer):
+            self._copy(inner)
+        reason = _why_not(layer)
+        if not reason:
+            memo_before = dict(self._memo)
+            try:
+                return _copy_layer(layer, self._memo)
+            except Exception as error:  # whatever a layer of another package raises
+                reason = f"{type(layer).__name__} cannot be copied: {error}"
+                self._memo.clear()  # of parts of the copy that failed
+                self._memo.update(memo_before)
+        self.reason = reason
+        for original in layers(layer):
+            self.shared[id(original)] = original
+            self._memo[id(original)] = original
+        return layer
+
+
+def _refuse_pipe(_: Any) -> NoReturn:
+    """Raise a TypeError in place of a copy of a pipe, which closes the original when deleted.
+
+    Neither `copy` nor `pickle` copies a pipe of use. `multiprocessing` passes pipes to other
+    processes by functions that it registers itself.
+    """
+    raise TypeError("a pipe to another process cannot be copied")
+
+
+def _why_not(layer: Any) -> str:
+    """Return why a copy of a layer must not even be tried; "" if it may be tried."""
+    name = type(layer).__name__
+    if runs_processes(layer):
+        return f"{name} runs in other processes"
+    inner = inner_environments(layer)
+    inner_modes = [getattr(environment, "render_mode", None) for environment in inner]
+    # A wrapper has the mode of the environment that shows the window.
+    if getattr(layer, "render_mode", None) == "human" and "human" not in inner_modes:
+        return f"{name} shows a window"
+    return ""
+
+
+def _copy_layer(layer: Any, memo: dict[int, Any]) -> Any:
+    """Return a copy of a layer, whose inner layers are copied and in the memo already."""
+    if isinstance(layer, tuple(map(loaded, _RECORDERS))):
+        (inner,) = inner_environments(layer)
+        memo[id(layer)] = memo[id(inner)]
+        return memo[id(layer)]
+    if not inner_environments(layer):
+        duplicate = copy.deepcopy(layer, memo)
+    else:
+        # Wrappers define how they are pickled, but a pickled VecNormalize loses what it wraps.
+        duplicate = object.__new__(type(layer))
+        memo[id(layer)] = duplicate
+        attributes = dict(vars(layer))
+        if "results_writer" in attributes:
+            attributes["results_writer"] = None  # so that a copy of a monitor writes no file
+        if "class_attributes" in attributes:  # of a VecEnvWrapper, shared by its class
+            memo[id(layer.class_attributes)] = layer.class_attributes
+        for name in INNER:  # first, as a wrapper looks up other attributes in what it wraps
+            if name in attributes:
+                vars(duplicate)[name] = copy.deepcopy(attributes[name], memo)
+        for name, value in attributes.items():
+            vars(duplicate)[name] = copy.deepcopy(value, memo)
+    if isinstance(duplicate, VectorEnv):
+        duplicate.closed = True  # so that a deleted copy closes nothing
+    return duplicate

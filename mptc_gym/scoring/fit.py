@@ -1,0 +1,111 @@
+"""Refuse environments that a policy was not made for, as far as the policy can tell."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, Final
+
+from gymnasium.spaces import Box
+
+from mptc_gym.layers import (
+    ask_processes,
+    is_environment,
+    layers,
+    loaded,
+    normaliser_flag,
+    plant_groups,
+    runs_processes,
+)
+from mptc_gym.scoring.opening import Plants
+from mptc_gym.scoring.policies import form_of
+
+_MODELS: Final = (
+    "stable_baselines3.common.base_class.BaseAlgorithm",
+    "stable_baselines3.common.policies.BaseModel",
+)
+
+
+def check_fit(policy: Any, plants: Plants) -> None:
+    """Raise a ValueError if a policy cannot be scored in these plants.
+
+    Wrappers that normalise must have the statistics of a training, and must not run in other
+    processes. A policy with a method `check_environment`, such as a controller in `agents`,
+    checks the plants itself. For a model of Stable-Baselines3, the plants must have the spaces
+    of its training and, as long as the model has the environments of its training, the windows
+    and wrappers of these environments.
+    """
+    for layer in layers(plants):
+        if runs_processes(layer):
+            _check_processes(layer)
+        elif normaliser_flag(layer):
+            _check_statistics(layer)
+    model: Any = form_of(policy).target
+    groups = plant_groups(plants)
+    wrappers = {group.wrappers for group in groups}
+    if hasattr(model, "check_environment"):
+        names = ", ".join(sorted({name for chain in wrappers for name in chain}))
+        model.check_environment(groups[0].parameters, names, plants.num_envs)
+    is_model = isinstance(model, tuple(map(loaded, _MODELS)))
+    if not is_model:
+        return
+    training = getattr(model, "env", None)
+    groups_of_training = plant_groups(training) if is_environment(training) else []
+    if groups_of_training:  # closed processes have none
+        _compare(
+            "windows (set points, errors, outputs, actions)",
+            {group.parameters.windows for group in groups_of_training},
+            {group.parameters.windows for group in groups},
+        )
+        _compare(
+            "wrappers",
+            {" of ".join(group.wrappers) or "none" for group in groups_of_training},
+            {" of ".join(chain) or "none" for chain in wrappers},
+        )
+    observation_space = plants.single_observation_space
+    _compare("observation space", [model.observation_space], [observation_space])
+    _compare("action space", [model.action_space], [plants.single_action_space])
+
+
+def _check_processes(layer: Any) -> None:
+    """Raise a ValueError if a wrapper of Gymnasium normalises in other processes."""
+    if any(ask_processes(layer, "has_wrapper_attr", "update_running_mean")):
+        raise ValueError(
+            "env must not normalise in other processes, where statistics cannot be kept from "
+            "changing: use DummyVecEnv or SyncVectorEnv"
+        )
+
+
+def _check_statistics(layer: Any) -> None:
+    """Raise a ValueError if a wrapper normalises observations by its initial statistics."""
+    statistics = vars(layer).get("obs_rms", {})
+    parts = statistics.values() if isinstance(statistics, dict) else [statistics]
+    for part in parts:
+        if not part.mean.any() and (part.var == 1.0).all():
+            raise ValueError(
+                f"env must have the statistics of the training in {type(layer).__name__}, got "
+                "initial statistics: load or copy the statistics of the training"
+            )
+
+
+def _compare(what: str, of_training: Collection[Any], of_env: Collection[Any]) -> None:
+    """Raise a ValueError if environments differ from those of a model's training.
+
+    `of_training` and `of_env` are collections of the same type: of windows, of wrappers, or of
+    one space.
+    """
+    if of_training == of_env:
+        return
+    expected = " and ".join(sorted(map(_in_words, of_training)))
+    received = " and ".join(sorted(map(_in_words, of_env)))
+    raise ValueError(
+        f"env must have the {what} of policy's training, {expected}, got {received}: use "
+        "evaluate(model, model.get_env()), or spec_of(model, id) of mptc_gym.sb3, in the same "
+        "VecNormalize and VecFrameStack"
+    )
+
+
+def _in_words(value: Any) -> str:
+    """Return a value as text; of a `Box`, its shape and the range of its bounds."""
+    if not isinstance(value, Box):
+        return str(value)
+    return f"shape {value.shape} within {value.low.min():g} to {value.high.max():g}"
