@@ -30,9 +30,7 @@ from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
 from tests.conftest import ROOT
 
-SMALL = Training(
-    steps=2, plants=4, segment=60, nodes=3, hidden=2, validation_episodes=2
-)
+SMALL = Training(steps=2, plants=4, segment=60, nodes=3, hidden=2, validation_episodes=2)
 RECIPE = replace(
     ppo.RECIPES["ppo"],
     plants=((8, {"setpoint": "random"}), (16, {"setpoint": "random", "noise_variance": 0.5})),

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import copy
 import copyreg
+from collections.abc import Iterator
+from contextlib import contextmanager
 from multiprocessing import connection
 from typing import Any, Final, NoReturn
 
@@ -53,12 +55,11 @@ class Copy:
     """
 
     def __init__(self, env: Any) -> None:
-        for pipe in _PIPES:
-            copyreg.pickle(pipe, _refuse_pipe)
         self.shared: dict[int, Any] = {}
         self.reason = ""
         self._memo: dict[int, Any] = {}  # of `copy.deepcopy`: copies by the `id` of originals
-        self.env = self._copy(env)
+        with _pipes_refused():
+            self.env = self._copy(env)
 
     def _copy(self, layer: Any) -> Any:
         """Return a copy of a layer and of the layers within it, or else the layer itself."""
@@ -82,12 +83,25 @@ class Copy:
         return layer
 
 
-def _refuse_pipe(_: Any) -> NoReturn:
-    """Raise a TypeError in place of a copy of a pipe, which closes the original when deleted.
+@contextmanager
+def _pipes_refused() -> Iterator[None]:
+    """Return a context in which the copy of a pipe is a TypeError.
 
-    Neither `copy` nor `pickle` copies a pipe of use. `multiprocessing` passes pipes to other
-    processes by functions that it registers itself.
+    Otherwise, the copy of a pipe closes the original when the copy is deleted.
     """
+    before = dict(copyreg.dispatch_table)
+    for pipe in _PIPES:
+        copyreg.pickle(pipe, _refuse_pipe)
+    try:
+        yield
+    finally:
+        for pipe in set(_PIPES):
+            del copyreg.dispatch_table[pipe]
+        copyreg.dispatch_table.update(before)
+
+
+def _refuse_pipe(_: Any) -> NoReturn:
+    """Raise a TypeError in place of a copy of a pipe."""
     raise TypeError("a pipe to another process cannot be copied")
 
 
