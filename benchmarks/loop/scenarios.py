@@ -1,6 +1,6 @@
-"""Define the cases, the options that choose a plant, and designs of other plants.
+"""Define the cases, the options that choose a plant, and random designs of plants.
 
-A design is a set of plants around the paper's: a grid over delay and gain, or drawn at random.
+A case is a plant, a set point and a length. A design is a list of plants around one plant.
 """
 
 import json
@@ -37,7 +37,7 @@ class Scenario:
 
 
 class _PaperPlant(NamedTuple):
-    """A plant of the paper, as part of a scenario's name and title."""
+    """A plant of the paper: its preset, and its part of a scenario's name and title."""
 
     suffix: str
     preset: str
@@ -91,7 +91,7 @@ PRESET_SCENARIOS = {
 @options
 @dataclass(frozen=True, kw_only=True)
 class PlantOptions:
-    """Options that choose the plant: from a file, a preset or single arguments."""
+    """Options that choose the plant: by a file, a preset or single arguments."""
 
     plant: Path | None = None
     """JSON file with arguments of the environment, such as the plant.json that
@@ -109,7 +109,7 @@ class PlantOptions:
         return ", ".join(filter(None, [self.preset, file, *self.set]))
 
     def words(self) -> list[str]:
-        """Return the words of a command line that make the same choice."""
+        """Return the words of a command line that choose the same plant."""
         words: list[str] = []
         if self.preset:
             words += ["--preset", self.preset]
@@ -167,16 +167,16 @@ class PlantOptions:
             a = Parameters.of_environment(arguments).a
             if abs(slowest_pole(a) or 0.0) > 1.0:
                 raise ValueError(
-                    "a must not have a root beyond the unit circle, as nothing holds such a "
-                    f"plant, got {list(a)}"
+                    "a must not have a root beyond the unit circle, as no controller of this "
+                    f"checkout holds such a plant, got {list(a)}"
                 )
-        except (TypeError, ValueError) as error:  # the first: of an unknown argument
+        except (TypeError, ValueError) as error:  # A TypeError names an unknown argument.
             raise UsageError(f"{', '.join(options)}: {error}") from error
         return arguments
 
 
-# Ranges of the random plants of sweeps and of training. With a gain factor below 0.74, 5 degC
-# is out of the flow's reach.
+# Ranges of the random plants of sweeps, by argument of the environment. With a gain factor
+# below 0.74, a set point of 5 degC is out of the flow's reach.
 SPANS = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),
@@ -184,27 +184,31 @@ SPANS = {
     "gain_factor": (0.75, 1.6),
     "time_constant_factor": (0.5, 2.0),
 }
+# The factors that drift in half of the plants, and the argument for the drift of each factor.
+DRIFTS = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_drift"}
 
 
 def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
     """Return `count` plants from a Latin hypercube over `SPANS`.
 
-    The second half of them drift: over `samples` samples, their gain and time constant move to
-    other values within the spans.
+    The second half of the plants drift: over `samples` samples, the factors of gain and time
+    constant move to other values within `SPANS`. A plant is a dictionary of arguments of the
+    environment. `seed` is the seed of the hypercube.
     """
     from scipy.stats.qmc import LatinHypercube  # here: slow to import
 
-    drifts = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_drift"}
     # A column for each argument, then one for each factor at the end of its drift.
-    low, high = np.array([*SPANS.values(), *(SPANS[name] for name in drifts)]).T
-    shares = LatinHypercube(len(low), rng=np.random.default_rng(seed)).random(count)
+    spans = [*SPANS.values(), *(SPANS[factor] for factor in DRIFTS)]
+    low, high = np.array(spans).T
+    shares = LatinHypercube(len(spans), rng=np.random.default_rng(seed)).random(count)
+    rows = (low + shares * (high - low)).round(4).tolist()
     plants: list[Arguments] = []
-    for row in (low + shares * (high - low)).round(4).tolist():
+    for number, row in enumerate(rows):
         plant = dict(zip(SPANS, row, strict=False))
         plant["delay"] = round(plant["delay"])
-        if len(plants) >= count // 2:
+        if number >= count // 2:
             final_factors = row[len(SPANS) :]
-            for (factor, drift), final in zip(drifts.items(), final_factors, strict=True):
+            for (factor, drift), final in zip(DRIFTS.items(), final_factors, strict=True):
                 plant[drift] = final / plant[factor]
             plant["drift_samples"] = samples
         plants.append(plant)
@@ -214,9 +218,9 @@ def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
 def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
     """Return a design around the paper's plant, moved to another plant.
 
-    The plants differ from `plant` by the same factors as those of the design from the paper's:
-    in delay, dead zone, the factors of gain and time constant, and in the noise variance as a
-    share of the square of the temperature change that the flow can cause.
+    The moved plants differ from `plant` by the same factors as the plants of the design differ
+    from the paper's: in delay, dead zone, and the factors of gain and time constant. The noise
+    variance keeps its ratio to the square of the temperature change that the flow can cause.
     """
     scales = _scales(Parameters(**plant))
     paper_scales = _scales(Parameters())
@@ -233,7 +237,7 @@ def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
 
 
 def _scales(plant: Parameters) -> dict[str, float]:
-    """Return what the values of a design are multiples of, by their names in `SPANS`."""
+    """Return the numbers of a plant that the values of a design scale with, by argument."""
     model = nominal(plant)
     reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0  # degC
     scales = {**vars(model.numbers), "noise_variance": reach**2}
