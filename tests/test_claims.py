@@ -9,7 +9,8 @@ import pandas as pd
 from benchmarks.claims import claims
 from benchmarks.claims.__main__ import main
 from benchmarks.claims.claims import CLAIMS, Claim, converged_at, examined
-from benchmarks.claims.runs import Batch, judge, sections, table, verdict
+from benchmarks.claims.findings import judge, sections, table, verdict
+from benchmarks.claims.runs import Batch
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.rollout import settled
 from tests.conftest import ROOT, trajectory
