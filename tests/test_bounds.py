@@ -277,7 +277,7 @@ class TestLeastPossible:
         with pytest.raises(np.linalg.LinAlgError):
             command.row(Scenario("a", "b", 1201, case), command.Options(episodes=1, seed=0))
         with pytest.raises(np.linalg.LinAlgError):
-            sweep.scale_of({**case, "delay": 17}, 1)
+            sweep.run_idle_valve({**case, "delay": 17}, 1)
 
     def test_score(self):
         least = least_possible(samples=600, setpoint=5.0)

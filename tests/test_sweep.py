@@ -34,7 +34,7 @@ def test_around_another_plant_a_design_spans_its_own_numbers():
 
 def test_a_plant_that_does_not_settle_has_no_limit():
     limits = [
-        sweep.scale_of({"setpoint": "square", "setpoint_period": period}, 1)["limit"]
+        sweep.run_idle_valve({"setpoint": "square", "setpoint_period": period}, 1)["limit"]
         for period in (600, 38)
     ]
     assert limits == [pytest.approx(0.911, abs=0.001), pytest.approx(np.nan, nan_ok=True)]
