@@ -8,7 +8,8 @@ from benchmarks import speed
 def test_ratios_compare_rounds_with_each_other(monkeypatch):
     clock = iter([0, 1, 3, 3, 5, 6, 6, 7, 11])  # began, and the end of either case
     monkeypatch.setattr(speed.time, "perf_counter", lambda: next(clock))
-    table = speed.compare({"slow": (list, 100), "fast": (list, 400)}, rounds=3)
+    cases = {"slow": speed.Case(list, 100), "fast": speed.Case(list, 400)}
+    table = speed.compare(cases, rounds=3)
     # Seconds: 1, 2, 1 and 2, 1, 4. Ratios of steps a second: 200/100, 400/50, 100/100.
     assert list(table["steps a second"]) == ["100", "200"]
     assert list(table["ratio to slow"]) == ["1.00 (1.00 to 1.00)", "2.00 (1.20 to 6.80)"]
