@@ -106,7 +106,9 @@ def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]
     controller.reset()
     plants: Any = make_plants(len(seeds), SAMPLES, **arguments)
     observation, _ = plants.reset(seed=seeds)
-    observations, actions, errors = [observation], [], []
+    observations = [observation]
+    actions = []
+    errors = []
     for _ in range(SAMPLES):
         # Beyond +-1 the actuator saturates: clipping does not change what the plant does.
         action = np.clip(controller.act(observation), -1.0, 1.0).astype(np.float32)
@@ -158,7 +160,9 @@ def _create(name: str, episodes: list[Episode]) -> str:
 
     plant, behaviour = IDS[name]
     arguments = arguments_of(plant)
-    idle = evaluate(lambda seen: np.zeros((len(seen), 1)), episodes=EVALUATIONS, **arguments)
+    idle = evaluate(
+        lambda observations: np.zeros((len(observations), 1)), episodes=EVALUATIONS, **arguments
+    )
     least_error = float(np.asarray(idle.least).mean())
     mean_error = float(-np.mean([episode.rewards for episode in episodes]))
     buffers = [

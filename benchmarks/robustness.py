@@ -121,7 +121,7 @@ def overview(rows: pd.DataFrame) -> pd.DataFrame:
     lines = []
     for name in RULES:
         by_case = rows[rows["agent"] == name].set_index("case")
-        noisy = by_case.loc["square-noise"]
+        noisy: Any = by_case.loc["square-noise"]
         argument = ROSTER[name].tuned_by
         ratios = {case: f"{by_case['ratio'][case]:.3f}" for case in CASES}
         line = {
@@ -138,8 +138,8 @@ def overview(rows: pd.DataFrame) -> pd.DataFrame:
 def finding(rows: pd.DataFrame) -> str:
     """Return the title of the picture: what the rules do in noise at one robustness."""
     noisy = rows[(rows["Ms"] == ROBUSTNESS) & (rows["case"] == "square-noise")]
-    least = noisy.loc[noisy["travel"].idxmin()]
-    most = noisy.loc[noisy["travel"].idxmax()]
+    least: Any = noisy.loc[noisy["travel"].idxmin()]
+    most: Any = noisy.loc[noisy["travel"].idxmax()]
     share = 100.0 * least["travel"] / most["travel"]
     return (
         f"At an Ms of {ROBUSTNESS:g}, {label(least['agent'])}'s valve travels {share:.0f} % as "

@@ -46,8 +46,9 @@ def work(options: Options) -> str:
     """Measure, print the tables and return the closing line."""
     from benchmarks.lib.report import on_screen
 
+    numbers_of_plants = ON_DEVICE if options.device else BATCHES
     with blame("--device"):
-        for n in ON_DEVICE if options.device else BATCHES:
+        for n in numbers_of_plants:
             environments = make_environments(n, options.device)
             cases = {name: stepping(envs) for name, envs in environments.items()}
             print(f"\nn = {n:,}\n{on_screen(compare(cases, options.rounds))}", flush=True)
@@ -136,10 +137,15 @@ def compare(cases: Mapping[str, Case], rounds: int) -> Any:
     rates = pd.DataFrame(steps / np.array(seconds), columns=[*cases])
     first = rates.columns[0]
     ratios = rates.div(rates[first], axis="index").quantile([0.1, 0.5, 0.9])
-    low, median, high = (row.map("{:.2f}".format) for _, row in ratios.iterrows())
+    texts = ratios.map("{:.2f}".format)
     table = {
         "steps a second": rates.median().map("{:,.0f}".format),
-        f"ratio to {first}": median + " (" + low + " to " + high + ")",
+        f"ratio to {first}": texts.loc[0.5]
+        + " ("
+        + texts.loc[0.1]
+        + " to "
+        + texts.loc[0.9]
+        + ")",
     }
     return pd.DataFrame(table).reset_index(names="case")
 

@@ -117,9 +117,9 @@ def work(options: Options) -> str:
     conditions = None if options.controllers.agent else conditions_of("sweep", options)
     results: dict[str, Any] = {}
     with results_folder(target, conditions) as folder:
-        kept = KeptResults(folder) if conditions else None
+        finished = KeptResults(folder) if conditions else None
         try:
-            results.update(options.controllers.fan_out.stream(tasks, "sweep", kept))
+            results.update(options.controllers.fan_out.stream(tasks, "sweep", finished))
         finally:
             if missing := len(tasks) - len(results):
                 provenance["missing"] = f"{missing} of {len(tasks)} tasks are missing"

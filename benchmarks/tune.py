@@ -194,8 +194,11 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
             arguments["dead_zone"] = min(zone * arguments["dead_zone"], LARGEST_ZONE * limit)
         if name == "noise":
             arguments["noise_variance"] *= noise
-        samples, first = round(duration * case.samples), round(duration * case.first)
-        scaled[name] = TuningCase(samples, first, arguments)
+        scaled[name] = TuningCase(
+            samples=round(duration * case.samples),
+            first=round(duration * case.first),
+            arguments=arguments,
+        )
     return scaled
 
 
@@ -211,7 +214,8 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     import pandas as pd
 
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
-    study, kept = optuna.create_study(), KeptResults(folder)
+    study = optuna.create_study()
+    finished = KeptResults(folder)
     spans = spans_of(ROSTER[name], plant)
     magnitudes: Any = {
         gain: optuna.distributions.FloatDistribution(abs(least), abs(most), log=True)
@@ -225,14 +229,14 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
                     seed=SEED + i, n_startup_trials=STARTUP, multivariate=True
                 )
                 trial = study.ask(magnitudes)
-                row = kept.load(f"trial {i}")
+                row = finished.load(f"trial {i}")
                 if row is None:
                     gains = {
                         gain: math.copysign(size, spans[gain][0])
                         for gain, size in trial.params.items()
                     }
                     row = score(name, plant, runs, FIRST_RUN, gains)
-                    kept.save(f"trial {i}", row)
+                    finished.save(f"trial {i}", row)
                 rows.append(row)
                 study.tell(trial, row["objective"])
                 advance()

@@ -70,6 +70,10 @@ def work(options: Options) -> str:
 
     After an error or an interruption the cases that have finished are printed.
     """
+    import pandas as pd
+
+    from benchmarks.lib.report import on_screen
+
     cases = options.plant.cases(SCENARIOS | PRESET_SCENARIOS)
     if options.package:
         return write_package(options.fan_out)
@@ -79,18 +83,10 @@ def work(options: Options) -> str:
     try:
         rows.update(options.fan_out.stream(tasks, "bounds"))
     finally:
-        print_table([rows[name] for name in tasks if name in rows])
+        if rows:
+            table = pd.DataFrame([rows[name] for name in tasks if name in rows])
+            print(on_screen(table), flush=True)
     return "\n" + textwrap.fill(NOTE, shutil.get_terminal_size((150, 24)).columns)
-
-
-def print_table(rows: list[dict[str, str]]) -> None:
-    """Print the rows of some cases, if there are any."""
-    import pandas as pd
-
-    from benchmarks.lib.report import on_screen
-
-    if rows:
-        print(on_screen(pd.DataFrame(rows)), flush=True)
 
 
 def row(case: Scenario, options: Options) -> dict[str, str]:

@@ -67,8 +67,9 @@ class SetPointLaw:
         # represent it: quantiles of the magnitude of a normal number.
         deviation = unknown.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
         shares = (np.arange(THRESHOLDS) + 0.5) / THRESHOLDS
-        thresholds = deviation * scipy.special.ndtri((1.0 + shares) / 2.0)
-        self._thresholds = thresholds if deviation > 0.0 else np.zeros(1)
+        self._thresholds = np.zeros(1)
+        if deviation > 0.0:
+            self._thresholds = deviation * scipy.special.ndtri((1.0 + shares) / 2.0)
         # After a change the output stands still for `lag` samples. Then it approaches what the
         # limits allow; this is the share of the way that it has made, by age of the level.
         age = np.arange(samples)
@@ -112,14 +113,17 @@ class SetPointLaw:
                 surprise[j + 1 :, j] = guess[j + 1 :] - expected
         return np.asarray(np.einsum("kj,kj->j", self._flow_response, surprise))
 
-    def _expected(self, ages: NDArray[np.intp], now: int, stay: Array, added: Array) -> Array:
-        """Return the mean of g at later ages of a level that is still held at age `now`.
+    def _expected(
+        self, ages: NDArray[np.intp], known_age: int, stay: Array, added: Array
+    ) -> Array:
+        """Return the mean of g at later ages of a level that is known to be held at an age.
 
-        `stay` is g by age if the level never changes. `added` is what a change adds to the mean
-        of g, summed up, from `longest + 1` samples before the change on.
+        `ages` are later than `known_age`, samples. `stay` is g by age if the level never
+        changes. `added` is what a change adds to the mean of g, summed up, from `longest + 1`
+        samples before the change on.
         """
         # The next level begins at an age from `first` to `longest`, all equally probable.
-        first = max(self._shortest, now + 1)
+        first = max(self._shortest, known_age + 1)
         count = self._longest - first + 1
         changed = np.clip((ages - first + 1) / count, 0.0, 1.0)
         # After a second change g is as often positive as negative, as levels are symmetric.
@@ -161,10 +165,10 @@ class SetPointLaw:
         if not self._impulse[0]:
             return lean
         for age in range(min(self._longest, samples) - 1, self._settled - 1, -1):
-            now = age - self._lag
+            known_age = age - self._lag  # when the flow is chosen
             ages = np.arange(age, min(samples, age + HORIZON))
-            worth = self._impulse[: len(ages)] @ self._expected(ages, now, lean, added)
-            count = self._longest - max(self._shortest, now + 1) + 1
+            worth = self._impulse[: len(ages)] @ self._expected(ages, known_age, lean, added)
+            count = self._longest - max(self._shortest, known_age + 1) + 1
             held_at_age = min(1.0, (self._longest - age) / count)  # probability
             lean[age] = np.clip(-worth / (self._impulse[0] * held_at_age), -1.0, 1.0)
         return lean

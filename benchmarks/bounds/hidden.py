@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.bounds.linear_program import Unknown
 from benchmarks.bounds.unknown import (
     filtered_covariance,
+    noise_system,
     predicted_variance,
     unknown_of_normal,
 )
@@ -35,9 +36,7 @@ def unknown_of_normal_load(model: LinearModel) -> Unknown:
     filtered = np.zeros_like(F)  # a known load has no variance
     if model.numbers.measurement_noise_variance > 0.0:
         filtered[:, :STEPS, :STEPS] = filtered_covariance(
-            F[:, :STEPS, :STEPS],
-            _noise_covariance(model),
-            model.numbers.measurement_noise_variance,
+            *noise_system(model), model.numbers.measurement_noise_variance
         )
     return unknown_of_normal(predicted_variance(filtered, F, Q, model.lag))
 
@@ -49,24 +48,15 @@ def unknown_of_hidden_load(model: LinearModel) -> Unknown:
     return unknown_of_normal(predicted_variance(filtered, F, Q, model.lag))
 
 
-def _noise_covariance(model: LinearModel) -> Array:
-    """Return the covariance of what xi(k) adds to the state of (28).
-
-    The shape is (samples, size, size), with the same matrix for all samples.
-    """
-    _, enters = model.state_space()
-    covariance = model.numbers.noise_variance * np.outer(enters, enters)
-    return np.broadcast_to(covariance, (len(model.load), *covariance.shape))
-
-
 def _with_load(model: LinearModel) -> tuple[Array, Array]:
     """Return F(k) and Q(k) of the state of (28), followed by the load's steps and its walk.
 
     x(k) = F(k) x(k-1) + a noise with the covariance Q(k). Both have the shape (samples, size,
     size). The load, degC, is the sum of the steps and the walk.
     """
-    samples, numbers = len(model.load), model.numbers
-    F_noise, _ = model.state_space()
+    numbers = model.numbers
+    F_noise, Q_noise = noise_system(model)
+    samples = len(F_noise)
     size = F_noise.shape[-1] + 2
     k = np.arange(samples)
     is_change = (k % LOAD_INTERVAL == 0) & (k > 0)
@@ -87,7 +77,7 @@ def _with_load(model: LinearModel) -> tuple[Array, Array]:
     step_variance = level_variance - np.square(stays) * variance_before
     walk_variance = is_change * LOAD_INTERVAL * numbers.disturbance_walk_variance
     Q = np.zeros((samples, size, size))
-    Q[:, :STEPS, :STEPS] = _noise_covariance(model)
+    Q[:, :STEPS, :STEPS] = Q_noise
     for part, variance in ((STEPS, step_variance), (WALK, walk_variance)):
         enters = np.zeros((samples, size))  # how a change of this part enters the state
         enters[:, 0] = model.load

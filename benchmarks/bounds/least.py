@@ -47,14 +47,12 @@ class LeastPossible(Estimate):
     The ends of the interval equal `value` where nothing is drawn.
     """
 
-    kind: str
-    """One of `KINDS`."""
-    idle: Estimate
-    """Mean |e| of the same episodes with an idle valve, degC."""
+    kind: str  # one of `KINDS`
+    idle: Estimate  # mean |e| of the same episodes with an idle valve, degC
+    # The terms of which `value` is the mean, degC: term i belongs to the episode of seed
+    # `seed + i`. For the kind "causal" a term alone is no bound. There is one term if the bound
+    # is the same for all episodes.
     episodes: tuple[float, ...]
-    """The terms of which `value` is the mean, degC: term i belongs to the episode of seed
-    `seed + i`. For the kind "causal" a term alone is no bound. There is one term if the bound
-    is the same for all episodes."""
 
     def score(self, errors: ArrayLike) -> Array:
         """Return scores of mean errors, degC: 0 for an idle valve, 1 for `value`.
@@ -152,21 +150,19 @@ def with_hidden_load(
     estimates = []
     for i, bound in enumerate(least.episodes):
         episode = parameters, least.kind, drawn.numbers[i], drawn.setpoints[i]
-        hidden = _error_sum(*episode, unknown_of_hidden_load)
-        seen = _error_sum(*episode, unknown_of_normal_load)
-        estimates.append(bound + (hidden - seen) / samples)
+        hidden_load = _error_sum(*episode, unknown_of_hidden_load)
+        known_load = _error_sum(*episode, unknown_of_normal_load)
+        estimates.append(bound + (hidden_load - known_load) / samples)
     return student(estimates)
 
 
 class _Episodes(NamedTuple):
     """What the environment draws for some episodes of N samples."""
 
-    numbers: Sequence[PlantNumbers[float]]
-    """The plant numbers of each episode."""
-    setpoints: Array
-    """y_d(k) for k = 0 to N, degC, shape (episodes, N + 1)."""
+    numbers: Sequence[PlantNumbers[float]]  # the plant numbers of each episode
+    setpoints: Array  # y_d(k) for k = 0 to N, degC, shape (episodes, N + 1)
+    # Mean |e(k)| over k = 1 to N with an idle valve, degC, shape (episodes,).
     idle_errors: Array
-    """Mean |e(k)| over k = 1 to N with an idle valve, degC, shape (episodes,)."""
 
 
 def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
@@ -187,11 +183,13 @@ def _bound(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
     """Return the bound of one of `KINDS`; the arguments are those of `least_possible`."""
-    drawn = _draw(parameters, samples, episodes if is_random(parameters) else 1, seed)
-    # Where noise and load alone are drawn, the bound is the same for all episodes.
-    bounds_differ = parameters.ranges or parameters.setpoint == "random"
+    if not is_random(parameters):
+        episodes = 1
+    drawn = _draw(parameters, samples, episodes, seed)
+    if not (parameters.ranges or parameters.setpoint == "random"):
+        episodes = 1  # Noise and load do not change the bound.
     values = []
-    for i in range(episodes if bounds_differ else 1):
+    for i in range(episodes):
         error_sum = _error_sum(parameters, kind, drawn.numbers[i], drawn.setpoints[i])
         # Rounded to be the same on all machines, as solvers differ in later digits.
         values.append(round(error_sum / samples, 6))
@@ -225,9 +223,10 @@ def _error_sum(
     unknown_of
         Returns what no controller knows of a plant: the bounds of E|m - n|.
     """
-    # A reference looks beyond the end of the episode.
-    ahead = int(numbers.delay) + len(parameters.b) + TAIL if kind == "reference" else 0
-    model = LinearModel(parameters, numbers, np.arange(len(setpoint) + ahead))
+    k = np.arange(len(setpoint))
+    if kind == "reference":  # which looks beyond the end of the episode
+        k = np.arange(len(setpoint) + int(numbers.delay) + len(parameters.b) + TAIL)
+    model = LinearModel(parameters, numbers, k)
     unforeseen = unknown_of(model)
     if kind == "reference":
         errors, flow = reference(model, unforeseen, setpoint)

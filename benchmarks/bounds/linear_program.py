@@ -41,10 +41,8 @@ class Unknown:
     Here m is the expected error and n what remains unknown, degC; see `unknown.py`.
     """
 
-    slopes: Array
-    """Ascending, from 0 to 1; or 1 alone if nothing is unknown. Shape (slopes,)."""
-    intercepts: Array
-    """degC, shape (samples, slopes)."""
+    slopes: Array  # ascending, from 0 to 1; or 1 alone if nothing is unknown; shape (slopes,)
+    intercepts: Array  # degC, shape (samples, slopes)
 
     def mean_error(self, m: Array) -> Array:
         """Return the lower bounds of E|m(k) - n(k)|, degC, shape (len(m),).
@@ -91,10 +89,8 @@ def response(A: Any, B: Any) -> Array:
 class Plan(NamedTuple):
     """The expected flow with the smallest bound, and this bound."""
 
-    errors: Array
-    """Lower bounds of E|e(k)|, degC, shape (samples,)."""
-    flow: Array
-    """The mean of u_a(k), t/h, shape (samples,)."""
+    errors: Array  # lower bounds of E|e(k)|, degC, shape (samples,)
+    flow: Array  # the mean of u_a(k), t/h, shape (samples,)
 
 
 def plan(
@@ -148,13 +144,16 @@ def plan(
     n = samples - 1 - start  # outputs after `start`, and flows from `start` on
     if n:
         output_of_past = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
-        # A line may be level near m = 0, where a quiet plan needs a slope.
-        slopes = np.maximum(unknown.slopes, SMALLEST_SLOPE if quiet else 0.0)
         lengths = np.repeat(unknown.lengths[start + 1 : samples], 2, axis=1).T.ravel()
+        slopes = unknown.slopes
         targets = (setpoint - output_of_past)[start + 1 :]
+        moves = 0
         if quiet:
-            first_move_from = flow[start - 1]  # the last past flow; 0 at the beginning
-            targets = np.concatenate([targets, [first_move_from], np.zeros(n - 1)])
+            # A line may be level near m = 0, where a quiet plan needs a slope.
+            slopes = np.maximum(slopes, SMALLEST_SLOPE)
+            last_flow = flow[start - 1]  # from which the first move starts; 0 at the beginning
+            targets = np.concatenate([targets, [last_flow], np.zeros(n - 1)])
+            moves = 2 * n
         program = _Program(
             A=A[start + 1 :, start + 1 :],
             B=B[start + 1 :, start:-1],
@@ -162,7 +161,7 @@ def plan(
             outputs=_variables(n, 0.0, -np.inf, np.inf),
             flows=_variables(n, price[start:-1], *model.limits),
             pieces=_variables(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
-            moves=_variables(2 * n if quiet else 0, TRAVEL_PRICE, 0.0, np.inf),
+            moves=_variables(moves, TRAVEL_PRICE, 0.0, np.inf),
         )
         flow[start:-1] = _solve(program, zeros=np.roots(model.parameters.b))
     if samples > 1:
@@ -277,8 +276,10 @@ def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
     errors = np.zeros(len(setpoint))
     for start, stop in held(setpoint):
         is_last = stop == len(setpoint)
-        beyond = np.full(0 if is_last else model.lag + TAIL, setpoint[start])
-        ahead = np.concatenate([setpoint[:stop], beyond])
+        ahead = setpoint[:stop]
+        if not is_last:
+            beyond = np.full(model.lag + TAIL, setpoint[start])
+            ahead = np.concatenate([ahead, beyond])
         planned = plan(model, unknown, ahead, past=flow[:start], quiet=True)
         flow = planned.flow
         errors[start:stop] = planned.errors[start:stop]

@@ -65,10 +65,8 @@ SLOPES = 1.0 - np.array([64, 53, 42, 31, 22, 14, 8, 4, 1, 0]) / 64.0
 class Distribution(NamedTuple):
     """A distribution of finitely many values for each sample of an episode."""
 
-    values: Array
-    """degC, shape (samples, atoms)."""
-    weights: Array
-    """Probabilities of the values, shape (samples, atoms)."""
+    values: Array  # degC, shape (samples, atoms)
+    weights: Array  # probabilities of the values, shape (samples, atoms)
 
 
 def unknown(model: LinearModel) -> Unknown:
@@ -107,15 +105,23 @@ def noise_variance(model: LinearModel) -> Array:
     The shape is (samples,). With a noisy transmitter it is the variance of the best prediction
     of y(k) from the readings, without a load.
     """
-    samples, numbers = len(model.load), model.numbers
-    if numbers.noise_variance == 0.0:
-        return np.zeros(samples)
-    F, enters = model.state_space()
-    Q = np.broadcast_to(numbers.noise_variance * np.outer(enters, enters), F.shape)
+    if model.numbers.noise_variance == 0.0:
+        return np.zeros(len(model.load))
+    F, Q = noise_system(model)
     filtered = np.zeros_like(F)  # with a perfect transmitter nothing is uncertain
-    if numbers.measurement_noise_variance > 0.0:
-        filtered = filtered_covariance(F, Q, numbers.measurement_noise_variance)
+    if model.numbers.measurement_noise_variance > 0.0:
+        filtered = filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
     return predicted_variance(filtered, F, Q, model.lag)
+
+
+def noise_system(model: LinearModel) -> tuple[Array, Array]:
+    """Return F(k) and Q(k) of the state of (28), each of shape (samples, size, size).
+
+    x(k) = F(k) x(k-1) + a noise with the covariance Q(k), which is the effect of xi(k).
+    """
+    F, enters = model.state_space()
+    covariance = model.numbers.noise_variance * np.outer(enters, enters)
+    return F, np.broadcast_to(covariance, F.shape)
 
 
 def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
@@ -158,13 +164,11 @@ class LoadChanges(NamedTuple):
     The load can change at k = `LOAD_INTERVAL`, 2 `LOAD_INTERVAL` and so on.
     """
 
+    # What each change adds to y(k), degC for each degC of the load, the latest change first;
+    # 0 where there are fewer changes. Shape (samples, largest number of changes).
     effects: Array
-    """What each change adds to y(k), degC for each degC of the load, the latest change first;
-    0 where there are fewer changes. Shape (samples, largest number of changes)."""
-    counts: NDArray[np.intp]
-    """The number of these changes, shape (samples,)."""
-    earlier: NDArray[np.intp]
-    """The number of changes up to k - d - 1, shape (samples,)."""
+    counts: NDArray[np.intp]  # the number of these changes, shape (samples,)
+    earlier: NDArray[np.intp]  # the number of changes up to k - d - 1, shape (samples,)
 
 
 def load_changes(model: LinearModel) -> LoadChanges:
@@ -311,10 +315,10 @@ def _intercepts_with_jumps(
     levels = amplitude * (np.arange(half) + 0.5) / half
     never_jumped = (1.0 - jump) ** changes.earlier
     intercepts = np.zeros((samples, len(SLOPES)))
-    for level in (0.0, *levels):
+    probabilities_of_levels = [never_jumped] + [(1.0 - never_jumped) / half] * half
+    for level, probability in zip((0.0, *levels), probabilities_of_levels, strict=True):
         at_level = at_level_0._replace(values=at_level_0.values + level * effect_of_level)
         by_sign = _intercepts(at_level, both_signs).reshape(samples, 2, -1)
-        probability = never_jumped if level == 0.0 else (1.0 - never_jumped) / half
         intercepts += probability[:, np.newaxis] * by_sign.mean(axis=1)
     return intercepts
 

@@ -16,7 +16,7 @@ import pandas as pd
 from agents import DirectNNController, PIController
 from agents.pi import SEARCHED_GAINS
 from benchmarks.claims.findings import OFTEN, Finding, judge, judge_share, judge_times
-from benchmarks.claims.runs import Batch, Gains, WeightLog, converged_at
+from benchmarks.claims.runs import PAPER_LENGTH, Batch, Gains, WeightLog, converged_at
 from benchmarks.loop import linear
 from benchmarks.loop.rollout import mean_error, settled
 from benchmarks.loop.scenarios import SETPOINTS as PAPER_SETPOINTS
@@ -54,8 +54,11 @@ def convergence(batch: Batch) -> Findings:
         title = setpoint.title
         is_soon = times <= SOON
         is_never = np.isinf(times)
-        quantity = f"weights converged within {SOON} samples, {title}"
-        yield judge_share(quantity, is_soon, often=True)
+        yield judge_share(
+            f"weights converged within {SOON} samples, {title}",
+            is_soon,
+            often=True,
+        )
         yield from judge_times(f"time until the weights have converged, {title}", times)
         yield judge_share(f"weights not converged when the run ends, {title}", is_never)
 
@@ -66,11 +69,17 @@ def dead_zone(batch: Batch) -> Findings:
         title = setpoint.title
         small = batch.run_nn(setpoint.samples, **setpoint.arguments)
         large = batch.run_nn(setpoint.samples, **setpoint.arguments, dead_zone=7.0)
-        quantity = f"settled when the run ends, dead zone 7 t/h, {title}"
-        yield judge_share(quantity, settled(large), often=True)
+        yield judge_share(
+            f"settled when the run ends, dead zone 7 t/h, {title}",
+            settled(large),
+            often=True,
+        )
         error_ratio = mean_error(large) / mean_error(small)
-        quantity = f"mean error at dead zone 7 t/h, as a multiple of the error at 5, {title}"
-        yield judge(quantity, error_ratio, at_least=1 + MUCH)
+        yield judge(
+            f"mean error at dead zone 7 t/h, as a multiple of the error at 5, {title}",
+            error_ratio,
+            at_least=1 + MUCH,
+        )
         for width, runs in ((5, small), (7, large)):
             yield judge(f"mean error, dead zone {width} t/h, {title}", mean_error(runs), "°C")
 
@@ -132,10 +141,17 @@ def pi_gains(batch: Batch) -> Findings:
     doubled_gains = Gains(2 * kp, ki)
     runs = batch.run_pi(doubled_gains, SAMPLES, **CONSTANT)
     limited_share = 100 * np.mean(np.abs(runs.applied[-300:]) == Parameters().u_max)
-    quantity = f"samples of the last 300 with the flow at a limit, Kp = {2 * kp:g}"
-    yield judge(quantity, limited_share, "%", at_least=50)
-    quantity = f"largest pole without dead zone and limits, Kp = {2 * kp:g}: unstable above 1"
-    yield judge(quantity, largest_pole(doubled_gains), at_least=1)
+    yield judge(
+        f"samples of the last 300 with the flow at a limit, Kp = {2 * kp:g}",
+        limited_share,
+        "%",
+        at_least=50,
+    )
+    yield judge(
+        f"largest pole without dead zone and limits, Kp = {2 * kp:g}: unstable above 1",
+        largest_pole(doubled_gains),
+        at_least=1,
+    )
     quantity = "largest pole without dead zone and limits"
     yield judge(f"{quantity}, Kp = {kp:g}", largest_pole(PAPER_PI))
     smallest = min(largest_pole(gains) for gains in lower_gains)
@@ -159,13 +175,18 @@ def against_pi(batch: Batch, gains: Gains) -> Findings:
             nn_errors = mean_error(batch.run_nn(setpoint.samples, **arguments))
             pi_errors = mean_error(batch.run_pi(gains, setpoint.samples, **arguments))
             case = f"{setpoint.title}{noise_title}"
-            quantity = f"mean error of the NN as a multiple of the PI's, {case}"
-            yield judge(quantity, nn_errors / pi_errors, at_most=1 - MUCH)
+            yield judge(
+                f"mean error of the NN as a multiple of the PI's, {case}",
+                nn_errors / pi_errors,
+                at_most=1 - MUCH,
+            )
             yield judge_share(f"the NN is better, {case}", nn_errors < pi_errors)
     nn_errors = mean_error(batch.run_nn(SAMPLES, dead_zone=7.0))
     pi_errors = mean_error(batch.run_pi(gains, SAMPLES, dead_zone=7.0))
-    quantity = "mean error of the NN as a multiple of the PI's, square wave, dead zone 7 t/h"
-    yield judge(quantity, nn_errors / pi_errors)
+    yield judge(
+        "mean error of the NN as a multiple of the PI's, square wave, dead zone 7 t/h",
+        nn_errors / pi_errors,
+    )
 
 
 def direction(batch: Batch) -> Findings:
@@ -181,8 +202,11 @@ def direction(batch: Batch) -> Findings:
         times <= SOON,
         often=True,
     )
-    quantity = "temperature exceeds this share when the run ends, after 600 samples"
-    yield judge_share(quantity, is_beyond[-1], often=True)
+    yield judge_share(
+        "temperature exceeds this share when the run ends, after 600 samples",
+        is_beyond[-1],
+        often=True,
+    )
     yield judge_share("temperature is on the wrong side when the run ends", runs.output[-1] < 0)
     yield from judge_times("time until the temperature exceeds this share", times)
 
@@ -194,7 +218,7 @@ def other_shapes(batch: Batch, shapes: dict[str, dict[str, int]]) -> Findings:
         paper_errors = mean_error(batch.run_nn(case.samples, **case.arguments))
         for (shape_title, shape), in_proportion in itertools.product(shapes.items(), GAINS):
             networks = batch.networks(**shape, in_proportion=in_proportion)
-            length = shape.get("length", 3)
+            length = shape.get("length", PAPER_LENGTH)
             windows: Arguments = {"setpoint_window": length, "error_window": length}
             runs = batch.run(networks, case.samples, **case.arguments, **windows)
             yield judge(
@@ -218,13 +242,21 @@ def reliability(batch: Batch) -> Findings:
             case = f"{nodes} nodes, one stuck at {stuck_at}, {GAINS[in_proportion]}"
             if stuck_at == 0:
                 yield judge_share(f"settled before the failure, {case}", settled(runs_before))
-            quantity = f"settled 600 samples after the failure, {case}"
-            yield judge_share(quantity, settled(runs_after))
-            quantity = f"mean error in the 600 samples after the failure, {case}"
-            yield judge(quantity, errors[nodes], "°C")
+            yield judge_share(
+                f"settled 600 samples after the failure, {case}",
+                settled(runs_after),
+            )
+            yield judge(
+                f"mean error in the 600 samples after the failure, {case}",
+                errors[nodes],
+                "°C",
+            )
             if nodes > 3:
-                quantity = f"this mean error as a multiple of the error with 3 nodes, {case}"
-                yield judge(quantity, errors[nodes] / errors[3], at_most=1 - NOTABLE)
+                yield judge(
+                    f"this mean error as a multiple of the error with 3 nodes, {case}",
+                    errors[nodes] / errors[3],
+                    at_most=1 - NOTABLE,
+                )
 
 
 def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None:
@@ -287,8 +319,11 @@ def direction_only(batch: Batch) -> Findings:
         yield judge_worst(plants.query("constant == 1 and delay == 18"), text)
     for setpoint, plants in designs.items():
         yield judge_worst(plants, f"all {len(plants)} combinations, {setpoint}")
-        quantity = f"combinations in which at least {OFTEN:.0%} of runs settle, {setpoint}"
-        yield judge(quantity, 100 * (plants["share"] >= OFTEN).mean(), "%")
+        yield judge(
+            f"combinations in which at least {OFTEN:.0%} of runs settle, {setpoint}",
+            100 * (plants["share"] >= OFTEN).mean(),
+            "%",
+        )
 
 
 def plants_that_settle(

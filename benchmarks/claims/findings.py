@@ -57,19 +57,19 @@ def judge(
         estimate = Estimate(number, number, number, 1)
     bounds = {"at least": at_least, "at most": at_most}
     criteria = [f"{name} {bound:g}" for name, bound in bounds.items() if isfinite(bound)]
-    shown = ""
+    answer = ""
     if criteria:
-        shown = "undecided"
+        answer = "undecided"
         if at_least <= estimate.low and estimate.high <= at_most:
-            shown = "yes"
+            answer = "yes"
         elif estimate.high < at_least or estimate.low > at_most:
-            shown = "no"
+            answer = "no"
     return {
         "quantity": quantity,
         "unit": unit,
         **vars(estimate),
         "criterion": " and ".join(criteria),
-        "shown": shown,
+        "shown": answer,
     }
 
 
@@ -99,7 +99,9 @@ def verdict(findings: Iterable[Finding]) -> str:
         return "cannot be tested from the text"
     if all(is_met):
         return "holds"
-    return "holds in part" if any(is_met) else "does not hold"
+    if any(is_met):
+        return "holds in part"
+    return "does not hold"
 
 
 def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) -> pd.DataFrame:
@@ -158,4 +160,6 @@ def _three_digits(value: float) -> str:
         return "never" if value > 0 else "?"
     if abs(value) >= 100:
         return f"{value:,.0f}"
-    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3f}"
+    if abs(value) >= 10:
+        return f"{value:.1f}"
+    return f"{value:.3f}"

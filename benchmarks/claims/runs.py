@@ -54,8 +54,11 @@ class Batch:
         direction
             The sign of the plant's gain that a network assumes.
         """
-        node_scale = PAPER_NODES / nodes if in_proportion else 1.0
-        input_scale = PAPER_LENGTH / length if in_proportion else 1.0
+        node_scale = 1.0
+        input_scale = 1.0
+        if in_proportion:
+            node_scale = PAPER_NODES / nodes
+            input_scale = PAPER_LENGTH / length
         paper = DirectNNController()
         return DirectNNController(
             n_inputs=2 * length,

@@ -112,7 +112,8 @@ class Exploration(BaseCallback):
 
     def __init__(self, first: float, last: float) -> None:
         super().__init__()
-        self._first, self._last = first, last
+        self._first = first
+        self._last = last
 
     def _on_step(self) -> bool:
         return True

@@ -64,7 +64,8 @@ class LinearModel:
         gain, time_constant = dynamics.factors(numbers, k // DRIFT_INTERVAL * DRIFT_INTERVAL)
         alpha, scale, load = dynamics.coefficients(gain, time_constant)
         shape = np.broadcast_shapes(np.shape(gain), np.shape(time_constant))
-        self.parameters, self.numbers = parameters, numbers
+        self.parameters = parameters
+        self.numbers = numbers
         self.alpha = np.empty((*shape, len(alpha)))
         for i, coefficient in enumerate(alpha):
             self.alpha[..., i] = coefficient
@@ -157,7 +158,9 @@ def step_test(parameters: Parameters) -> dict[str, float]:
         raise ValueError(f"a must be of a stable plant for a step test, got {parameters.a}")
     if plant.gain == 0.0:
         raise ValueError(f"b must have a sum other than 0 for a gain, got {parameters.b}")
-    settling = math.log(TRANSIENT) / math.log(slowest_pole) if slowest_pole else 0.0
+    settling = 0.0  # samples
+    if slowest_pole:
+        settling = math.log(TRANSIENT) / math.log(slowest_pole)
     # Twice as long, as transients of repeated poles last longer.
     samples = len(parameters.b) + 2 * math.ceil(settling) + 2
     # The response begins with the last sample at which the output stands still.
@@ -199,13 +202,9 @@ class LinearLoop:
     A transfer function is a numerator and a denominator: coefficients of z^0, z^-1 and so on.
     """
 
-    controller: tuple[Array, Array]
-    """The transfer function from e, degC, to u, t/h."""
-    plant: tuple[Array, Array]
-    """The transfer function from u, t/h, to y, degC, without the delay: B(z^-1) and A(z^-1) of
-    (28)."""
-    delay: int
-    """The plant's d, samples."""
+    controller: tuple[Array, Array]  # from e, degC, to u, t/h
+    plant: tuple[Array, Array]  # from u to y without the delay: B(z^-1) and A(z^-1) of (28)
+    delay: int  # the plant's d, samples
 
     @classmethod
     def of(cls, controller: LinearController, plant: LinearModel) -> "LinearLoop":
