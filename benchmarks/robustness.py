@@ -138,8 +138,8 @@ def overview(rows: pd.DataFrame) -> pd.DataFrame:
 def finding(rows: pd.DataFrame) -> str:
     """Return the title of the picture: what the rules do in noise at one robustness."""
     noisy = rows[(rows["Ms"] == ROBUSTNESS) & (rows["case"] == "square-noise")]
-    least: Any = noisy.loc[noisy["travel"].idxmin()]
-    most: Any = noisy.loc[noisy["travel"].idxmax()]
+    ordered = noisy.sort_values("travel")
+    least, most = ordered.iloc[0], ordered.iloc[-1]
     share = 100.0 * least["travel"] / most["travel"]
     return (
         f"At an Ms of {ROBUSTNESS:g}, {label(least['agent'])}'s valve travels {share:.0f} % as "
