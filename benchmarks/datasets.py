@@ -16,6 +16,8 @@ from benchmarks.lib.errors import UnfinishedError
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.lib.storage import out_folder
 from mptc_gym import PRESETS, evaluate
+from mptc_gym.acting import rollout
+from mptc_gym.adapters import adapted
 
 SAMPLES = 1200  # in an episode
 EPISODES = 100  # in a data set
@@ -104,21 +106,18 @@ def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]
     arguments = arguments_of(plant)
     controller: Any = ROSTER[name].in_service(arguments, len(seeds), SEED)
     controller.reset()
-    plants: Any = make_plants(len(seeds), SAMPLES, **arguments)
-    observation, _ = plants.reset(seed=seeds)
-    observations = [observation]
-    actions = []
-    errors = []
-    for _ in range(SAMPLES):
+    actions: list[NDArray[np.float32]] = []  # of each sample, shape (episodes, 1)
+
+    def act(observations: Any) -> NDArray[np.float32]:
         # Beyond +-1 the actuator saturates: clipping does not change what the plant does.
-        action = np.clip(controller.act(observation), -1.0, 1.0).astype(np.float32)
-        observation, _, _, _, info = plants.step(action)
-        actions.append(action)
-        observations.append(observation)
-        errors.append(info["error"])
-    observations_of_all = np.stack(observations, axis=1)
+        actions.append(np.clip(controller.act(observations), -1.0, 1.0).astype(np.float32))
+        return actions[-1]
+
+    plants = adapted(make_plants(len(seeds), SAMPLES, **arguments))
+    samples = list(rollout(plants, act, SAMPLES, seeds))
+    observations_of_all = np.stack([sample.observations for sample in samples], axis=1)
     actions_of_all = np.stack(actions, axis=1)
-    rewards_of_all = -np.abs(np.stack(errors, axis=1))
+    rewards_of_all = -np.abs([sample.infos["error"] for sample in samples[1:]]).T
     return [
         Episode(name, seed, observations_of_all[i], actions_of_all[i], rewards_of_all[i])
         for i, seed in enumerate(seeds)

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from benchmarks.bounds.linear_program import Unknown, equations, response
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import held
+from mptc_gym.signals import Levels
 
 Array = NDArray[np.float64]
 
@@ -55,10 +56,10 @@ class SetPointLaw:
         at_start = LinearModel(parameters, model.numbers, 0)
         self._flow_response = response(*equations(model, samples))
         self._lag = model.lag
-        # A level is uniform in +-amplitude, degC, and is held from shortest to longest samples.
-        self._amplitude = parameters.setpoint_amplitude
-        self._shortest = max(1, -(-parameters.setpoint_period // 6))  # rounded up
-        self._longest = max(self._shortest, parameters.setpoint_period // 2)
+        levels = Levels(parameters)
+        self._amplitude = levels.amplitude
+        self._shortest = levels.shortest
+        self._longest = levels.longest
         # The largest temperature, degC, that the flow can hold on both sides of 0.
         low, high = model.limits
         gain = min(float(np.abs(at_start.gain)), LARGEST_GAIN)
