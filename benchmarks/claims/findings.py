@@ -15,10 +15,10 @@ Finding = dict[str, Any]  # a row of the table of numbers, as `judge` returns it
 
 NOTE = (
     "Each case is run with independent initial weights and noise. A mean error is the mean of "
-    "one run over its samples; the number in the table, like a ratio of such errors, is the "
-    "median over the runs. A criterion counts as met only if the entire 95 % confidence "
-    "interval satisfies it. A claim holds if all its criteria are met, and it holds in part if "
-    "some of them are."
+    "|e| over the samples of one run. A mean error in the table is the median over the runs, "
+    "and so is a ratio of mean errors. A criterion counts as met only if the entire 95 % "
+    "confidence interval satisfies it. A claim holds if all its criteria are met, and it holds "
+    "in part if some of its criteria are met."
 )
 OFTEN = 0.9  # "works", "converges": in at least this share of the runs
 
