@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -36,52 +36,64 @@ class Scenario:
         return Parameters(**self.arguments)
 
 
-class _PaperPlant(NamedTuple):
-    """A plant of the paper: its preset, and its part of a scenario's name and title."""
-
-    suffix: str
-    preset: str
-    title: str
-
-
-# The text of the paper describes the plants; only its figures show the set point. Two set
-# points are used here: the environment's square wave between +5 and -5 degC, 300 samples each,
-# over two periods; and a step to 5 degC.
-_PAPER_PLANTS = (
-    _PaperPlant("", "paper", "dead zone 5 t/h, no noise (Figs 5 and 10)"),
-    _PaperPlant("-dead-zone-7", "dead-zone-7", "dead zone 7 t/h, no noise (Figs 6 and 7)"),
-    _PaperPlant("-noise", "noisy", "dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)"),
-)
 SETPOINTS = (
     Scenario("square", "square wave", 1200, {}),
     Scenario("constant", "constant set point", 600, {"setpoint": 5.0}),
 )
-"""The set points of the paper's cases, on the environment's default plant."""
+"""The set points of the paper's cases, on the environment's default plant.
 
+The text of the paper describes the plants; only its figures show the set point. Two set points
+are used here: the environment's square wave between +5 and -5 degC, 300 samples each, over two
+periods; and a step to 5 degC.
+"""
 
-def _paper_scenarios() -> dict[str, Scenario]:
-    """Return every set point on every plant of the paper, and steps of the load, by name."""
-    scenarios = [
-        Scenario(
-            setpoint.name + plant.suffix,
-            f"{setpoint.title}, {plant.title}",
-            setpoint.samples,
-            {**PRESETS[plant.preset], **setpoint.arguments},
-        )
-        for setpoint in SETPOINTS
-        for plant in _PAPER_PLANTS
-    ]
+_CONSTANT = SETPOINTS[1].arguments
+SCENARIOS = {
+    "square": Scenario(
+        "square",
+        "square wave, dead zone 5 t/h, no noise (Figs 5 and 10)",
+        1200,
+        PRESETS["paper"],
+    ),
+    "square-dead-zone-7": Scenario(
+        "square-dead-zone-7",
+        "square wave, dead zone 7 t/h, no noise (Figs 6 and 7)",
+        1200,
+        PRESETS["dead-zone-7"],
+    ),
+    "square-noise": Scenario(
+        "square-noise",
+        "square wave, dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)",
+        1200,
+        PRESETS["noisy"],
+    ),
+    "constant": Scenario(
+        "constant",
+        "constant set point, dead zone 5 t/h, no noise (Figs 5 and 10)",
+        600,
+        {**PRESETS["paper"], **_CONSTANT},
+    ),
+    "constant-dead-zone-7": Scenario(
+        "constant-dead-zone-7",
+        "constant set point, dead zone 7 t/h, no noise (Figs 6 and 7)",
+        600,
+        {**PRESETS["dead-zone-7"], **_CONSTANT},
+    ),
+    "constant-noise": Scenario(
+        "constant-noise",
+        "constant set point, dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)",
+        600,
+        {**PRESETS["noisy"], **_CONSTANT},
+    ),
     # A boiler's daily duty. At 5 degC the required flow stays outside the dead zone.
-    load = Scenario(
+    "load": Scenario(
         "load",
         "load steps within ±1.5 °C at a held set point, dead zone 5 t/h, no noise",
         1200,
-        {"setpoint": 5.0, "disturbance_amplitude": 1.5, "disturbance_interval": 200.0},
-    )
-    return {scenario.name: scenario for scenario in [*scenarios, load]}
-
-
-SCENARIOS = _paper_scenarios()
+        {**_CONSTANT, "disturbance_amplitude": 1.5, "disturbance_interval": 200.0},
+    ),
+}
+"""The cases of the paper, and steps of the load, by name."""
 PRESET_SCENARIOS = {
     name: Scenario(name, f"preset {name}", 1200, dict(arguments))
     for name, arguments in PRESETS.items()
@@ -130,7 +142,7 @@ class PlantOptions:
             return default
         setpoints: tuple[Scenario, ...] = SETPOINTS
         if {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments):
-            setpoints = (Scenario("run", "its own set point", 1200, {}),)
+            setpoints = (Scenario("run", "the set point of the plant's arguments", 1200, {}),)
         return {
             setpoint.name: Scenario(
                 setpoint.name,
