@@ -24,10 +24,10 @@ def test_it_runs_with_and_without_pytorch(torch, monkeypatch, capsys):
         monkeypatch.setattr(speed, name, value)
     monkeypatch.setattr(speed.importlib.util, "find_spec", lambda _: torch or None)
     assert speed.main(["--rounds", "1"]) == 0
-    shown = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for words in ("CartPole-v1", "n = 2", "MiddlePoint-v0, hard"):
-        assert words in shown
-    assert ("in PyTorch" in shown) is torch
+        assert words in printed
+    assert ("in PyTorch" in printed) is torch
     if torch:
         assert speed.main(["--rounds", "1", "--device", "cpu"]) == 0
         assert "n = 3\n" in capsys.readouterr().out
