@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
+from mptc_gym.acting import rollout
+from mptc_gym.adapters import adapted
 from numpy.typing import NDArray
 
 from benchmarks.lib.command import Count, Names, Parameter, command, options
@@ -21,14 +23,14 @@ SAMPLES = 1200  # in an episode
 EPISODES = 100  # in a data set
 SEED = SEEDS["data sets"].first  # of the first episode
 EVALUATIONS = 50  # episodes to evaluate learners on, none of which is in the data
-# Names of controllers, which take turns, episode by episode.
+# Names of the controllers of a data set, which take turns, episode by episode.
 BEHAVIOURS = {
     "pi": ("pi",),
     "smith": ("smith",),
     "mixed": ("pi", "pi-simc", "smith", "nn"),
 }
-# A set gets a new version where what it records changes. Since v1 the Smith predictor has
-# another anti-windup, and it and PI (SIMC) are tuned to an Ms of 1.6.
+# A data set gets a new version when its content changes. In v1 the Smith predictor has another
+# anti-windup than in v0, and the Smith predictor and PI (SIMC) are tuned to an Ms of 1.6.
 VERSIONS = {"pi": 0, "smith": 1, "mixed": 1}
 IDS = {
     f"middlepoint/{plant}/{behaviour}-v{VERSIONS[behaviour]}": (plant, behaviour)
@@ -65,7 +67,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Write data sets."""
+    """Write data sets, and print the mean errors of each."""
     root = out_folder(Path(os.environ.get(VARIABLE) or HOME).expanduser().absolute(), VARIABLE)
     for name in dict.fromkeys(options.ids or IDS):
         print(f"{name}: {write(root, name, options.episodes)}", flush=True)
@@ -89,12 +91,11 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES) -> list[Episode
     The controllers take turns. Episode i has the seed `SEED + i`.
     """
     names = BEHAVIOURS[behaviour][:episodes]
-    by_seed: dict[int, Episode] = {}
+    recorded: list[Episode] = []
     for turn, name in enumerate(names):
         seeds = list(range(SEED + turn, SEED + episodes, len(names)))
-        for episode in _record_controller(plant, name, seeds):
-            by_seed[episode.seed] = episode
-    return [by_seed[seed] for seed in sorted(by_seed)]
+        recorded += _record_controller(plant, name, seeds)
+    return sorted(recorded, key=lambda episode: episode.seed)
 
 
 def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]:
@@ -105,37 +106,37 @@ def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]
     arguments = arguments_of(plant)
     controller: Any = ROSTER[name].in_service(arguments, len(seeds), SEED)
     controller.reset()
-    plants: Any = make_plants(len(seeds), SAMPLES, **arguments)
-    observation, _ = plants.reset(seed=seeds)
-    observations = [observation]
-    actions = []
-    errors = []
-    for _ in range(SAMPLES):
+    actions: list[NDArray[np.float32]] = []  # of each sample, shape (episodes, 1)
+
+    def act(observations: Any) -> NDArray[np.float32]:
         # Beyond +-1 the actuator saturates: clipping does not change what the plant does.
-        action = np.clip(controller.act(observation), -1.0, 1.0).astype(np.float32)
-        observation, _, _, _, info = plants.step(action)
-        actions.append(action)
-        observations.append(observation)
-        errors.append(info["error"])
-    columns = zip(
-        seeds,
-        np.stack(observations, axis=1),
-        np.stack(actions, axis=1),
-        np.stack([-np.abs(error) for error in errors], axis=1),
-        strict=True,
-    )
-    return [Episode(name, *column) for column in columns]
+        actions.append(np.clip(controller.act(observations), -1.0, 1.0).astype(np.float32))
+        return actions[-1]
+
+    plants = adapted(make_plants(len(seeds), SAMPLES, **arguments))
+    samples = list(rollout(plants, act, SAMPLES, seeds))
+    observations_of_all = np.stack([sample.observations for sample in samples], axis=1)
+    actions_of_all = np.stack(actions, axis=1)
+    rewards_of_all = -np.abs([sample.infos["error"] for sample in samples[1:]]).T
+    return [
+        Episode(name, seed, observations_of_all[i], actions_of_all[i], rewards_of_all[i])
+        for i, seed in enumerate(seeds)
+    ]
 
 
 def write(root: Path, name: str, episodes: int) -> str:
-    """Write a complete data set or none, replacing that of this id; return its mean errors."""
+    """Write a complete data set or none, replacing the data set of this id.
+
+    `root` is Minari's folder. The mean errors are returned as text. An `UnfinishedError` is
+    raised if the files cannot be written.
+    """
     place = root / name
     logged = record(*IDS[name], episodes)
     try:
         # Minari does not list the contents of hidden folders.
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
-            # HDF5 crashes where a disk is full. So a file as large as a data set is written,
-            # and removed, before.
+            # HDF5 crashes where a disk is full. So a file as large as a data set is written
+            # before, and removed.
             room = Path(partial, "room")
             room.write_bytes(bytes(1_000_000 + episodes * 250_000))
             room.unlink()
@@ -152,13 +153,15 @@ def write(root: Path, name: str, episodes: int) -> str:
 
 
 def _create(name: str, episodes: list[Episode]) -> str:
-    """Write a data set to Minari's folder, and return its mean errors."""
+    """Write a data set to Minari's folder, and return its mean errors as text."""
     import minari
     from minari.data_collector import EpisodeBuffer
 
     plant, behaviour = IDS[name]
     arguments = arguments_of(plant)
-    idle = evaluate(_keep_valve_idle, episodes=EVALUATIONS, **arguments)
+    idle = evaluate(
+        lambda observations: np.zeros((len(observations), 1)), episodes=EVALUATIONS, **arguments
+    )
     least_error = float(np.asarray(idle.least).mean())
     mean_error = float(-np.mean([episode.rewards for episode in episodes]))
     buffers = [
@@ -180,7 +183,7 @@ def _create(name: str, episodes: list[Episode]) -> str:
         eval_env=env,
         algorithm_name=", ".join(BEHAVIOURS[behaviour]),
         author="The mptc_gym developers",
-        author_email="",  # None would be a warning, here and below
+        author_email="",  # Minari warns of None, here and in the next argument.
         code_permalink="",
         description=f"Preset {plant} with random set points. The reward is -|error| in degC.",
         ref_min_score=-idle.mean_error * SAMPLES,
@@ -194,19 +197,13 @@ def _create(name: str, episodes: list[Episode]) -> str:
         "idle_error": idle.mean_error,
         "evaluation_seeds": list(idle.seeds),
     }
+    controllers = [{"controller": episode.controller} for episode in episodes]
     dataset.storage.update_metadata(metadata)
-    dataset.storage.update_episode_metadata(
-        [{"controller": episode.controller} for episode in episodes]
-    )
+    dataset.storage.update_episode_metadata(controllers)
     return (
         f"mean |e| {mean_error:.3f} °C, least possible {least_error:.3f}, "
         f"idle valve {idle.mean_error:.3f}"
     )
-
-
-def _keep_valve_idle(observations: Any) -> NDArray[np.float64]:
-    """Return the actions that keep the flow at 0 t/h, whatever the observations."""
-    return np.zeros((len(observations), 1))
 
 
 main = command("datasets", Options, work)

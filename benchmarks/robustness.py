@@ -22,17 +22,19 @@ if TYPE_CHECKING:
 
 RULES = [name for name, spec in ROSTER.items() if spec.tuned_by]
 CASES = "square", "square-noise", "constant", "load"
-PICTURED = {
+PANELS = {  # of the picture: cases and titles
     "square-noise": "square wave with noise, R = 0.5 °C²",
     "load": "load steps at a held set point",
 }
-SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3
+SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3  # values of Ms
+TICKS = 200, 500, 1000, 2000, 5000  # of the valve travel in noise, t/h
 TEXT = (
     "Each rule has one number, a time constant, with which its loop has an Ms of "
     f"{ROBUSTNESS:g} on the paper's plant, away from the dead zone and the limits. The columns "
-    "of the cases are mean errors divided by the lowest achievable error. Stable delays, in "
-    "samples, are those around the plant's 18 with which the loop is stable."
+    "of the cases are mean errors divided by the lowest achievable error. The range of stable "
+    "delays, in samples, is the range around the plant's 18 in which the loop is stable."
 )
+CAPTION = "Error over valve travel along the robustness of three rules"
 
 
 @options
@@ -52,7 +54,7 @@ def work(options: Options) -> str:
 
     from benchmarks.lib.report import Section, write_report
 
-    made = origin()
+    provenance = origin()
     bounds: dict[str, Any] = {name: partial(lowest, SCENARIOS[name]) for name in CASES}
     loops: dict[str, Any] = {
         f"{name}, Ms {ms:g}": partial(run_rule, name, ms, options.runs)
@@ -62,26 +64,30 @@ def work(options: Options) -> str:
     results = dict(options.fan_out.stream({**bounds, **loops}, "robustness"))
     table = pd.DataFrame([row for name in loops for row in results[name]])
     table["ratio"] = table["mean_error"] / table["case"].map(results)
-    at_one = table[table["Ms"] == ROBUSTNESS]
-    picture = {"robustness.png": "Error over valve travel along the robustness of three rules"}
+    compared = table[table["Ms"] == ROBUSTNESS]
     title = f"Three rules at an Ms of {ROBUSTNESS:g}"
-    sections = [Section(title, [TEXT], overview(at_one), pictures=picture)]
+    pictures = {"robustness.png": CAPTION}
+    sections = [Section(title, [TEXT], overview(compared), pictures=pictures)]
     with results_folder(options.out) as folder:
         write_csv(folder / "robustness.csv", table)
         draw(table, folder / "robustness.png")
-        write_report(folder, "Rules at one robustness", sections, made)
+        write_report(folder, "Rules at one robustness", sections, provenance)
     return f"The report, all numbers and the picture are in {options.out}/"
 
 
 def lowest(scenario: Scenario) -> float:
-    """Return the lowest achievable mean error of a case, °C."""
+    """Return the lowest achievable mean error of a case, degC."""
     from benchmarks.bounds.least import least_possible
 
     return least_possible(samples=scenario.samples, **scenario.arguments).value
 
 
 def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
-    """Return a row for each case: the results of a rule that is tuned to an Ms."""
+    """Return a row for each case: the results of a rule that is tuned to an Ms.
+
+    A row has the name of the rule, its Ms and time constant, s, the range of stable delays,
+    samples, the case, and means over the runs: the error, degC, and the valve travel, t/h.
+    """
     spec = replace(ROSTER[name], sensitivity=sensitivity)
     shortest, longest = spec.loop({}).stable_delays() or (None, None)
     rows = []
@@ -89,8 +95,7 @@ def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
         scenario = SCENARIOS[case]
         parameters = scenario.parameters
         count = runs if is_random(parameters) else 1
-        controller: Any = spec.make(scenario.arguments, count, SEED)
-        trajectory = spec.run(scenario.arguments, scenario.samples, count, SEED, controller)
+        trajectory = spec.run(scenario.arguments, scenario.samples, count, SEED)
         measures = measure(trajectory, parameters)
         row = {
             "agent": name,
@@ -107,23 +112,25 @@ def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
 
 
 def overview(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the table of the report: a row for each rule, a column for each case."""
+    """Return the table of the report, as text: a row for each rule, a column for each case.
+
+    `rows` are those of `run_rule` at one Ms, with the column `ratio`.
+    """
     import pandas as pd
 
     lines = []
     for name in RULES:
-        of_rule = rows[rows["agent"] == name]
-        by_case, first = of_rule.set_index("case"), of_rule.iloc[0]
+        by_case = rows[rows["agent"] == name].set_index("case")
+        noisy: Any = by_case.loc["square-noise"]
         argument = ROSTER[name].tuned_by
+        ratios = {case: f"{by_case['ratio'][case]:.3f}" for case in CASES}
         line = {
             "controller": label(name),
-            "time constant": f"{argument.replace('_', ' ')} {first[argument]:.3g} s",
+            "time constant": f"{argument.replace('_', ' ')} {noisy[argument]:.3g} s",
+            **ratios,
+            "valve travel in noise (t/h)": f"{noisy['travel']:,.0f}",
+            "stable delays": f"{noisy['shortest_delay']:g} to {noisy['longest_delay']:g}",
         }
-        for case in CASES:
-            line[case] = f"{float(by_case['ratio'][case]):.3f}"
-        travel = float(by_case["travel"]["square-noise"])
-        line["valve travel in noise (t/h)"] = f"{travel:,.0f}"
-        line["stable delays"] = f"{first['shortest_delay']:g} to {first['longest_delay']:g}"
         lines.append(line)
     return pd.DataFrame(lines)
 
@@ -142,26 +149,28 @@ def finding(rows: pd.DataFrame) -> str:
 
 
 def draw(rows: pd.DataFrame, path: Path) -> None:
-    """Draw error over valve travel, a panel for each case of `PICTURED`."""
+    """Draw error ratio over valve travel, a panel for each case of `PANELS`.
+
+    `rows` are those of `run_rule`, with the column `ratio`.
+    """
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator, NullLocator
 
     from benchmarks.lib.pictures import open_panels
 
-    with open_panels(path, [*PICTURED.values()], 3.1, 2, finding(rows)) as panels:
-        for panel, case in zip(panels.axes, PICTURED, strict=True):
-            of_case = rows[rows["case"] == case]
+    with open_panels(path, [*PANELS.values()], 3.1, 2, finding(rows)) as panels:
+        for panel, case in zip(panels.axes, PANELS, strict=True):
+            rows_of_case = rows[rows["case"] == case]
             for name in RULES:
-                _draw_rule(panel, of_case[of_case["agent"] == name], name)
+                _draw_rule(panel, rows_of_case[rows_of_case["agent"] == name], name)
             panel.set_xlabel("valve travel in a run (t/h)")
             panel.yaxis.set_major_locator(MaxNLocator(5))
-        first = panels.axes[0]
-        first.set_xscale("log")
-        ticks = [200, 500, 1000, 2000, 5000]
-        first.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
-        first.xaxis.set_minor_locator(NullLocator())
-        first.set_ylabel("mean error / lowest achievable")
-        handles, names = first.get_legend_handles_labels()
+        noisy = panels.axes[0]
+        noisy.set_xscale("log")
+        noisy.set_xticks(TICKS, [f"{tick:,}" for tick in TICKS])
+        noisy.xaxis.set_minor_locator(NullLocator())
+        noisy.set_ylabel("mean error / lowest achievable")
+        handles, names = noisy.get_legend_handles_labels()
         large: Any = {"marker": "o", "markersize": 9, "markeredgecolor": "k", "linestyle": ""}
         handles.append(Line2D([], [], color="0.8", **large))
         names.append(f"Ms {ROBUSTNESS:g}; numbers: Ms of the ends")
@@ -169,15 +178,14 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
 
 
 def _draw_rule(panel: Any, rows: pd.DataFrame, name: str) -> None:
-    """Draw the line of a rule: with Ms at its ends, and the Ms of the table emphasised."""
+    """Draw the line of a rule, with the Ms at its ends and a large mark at `ROBUSTNESS`."""
     colour, marker = ROSTER[name].look
     style: Any = {"color": colour, "marker": marker}
     panel.plot(rows["travel"], rows["ratio"], **style, markersize=4, label=label(name))
     compared = rows[rows["Ms"] == ROBUSTNESS]
     panel.plot(compared["travel"], compared["ratio"], **style, ms=10, mec="k")
-    for i in (0, -1):
-        end = rows.iloc[i]
-        offset: Any = {"xytext": (5, 4), "textcoords": "offset points"}
+    offset: Any = {"xytext": (5, 4), "textcoords": "offset points"}
+    for end in (rows.iloc[0], rows.iloc[-1]):
         place = end["travel"], end["ratio"]
         panel.annotate(f"{end['Ms']:g}", place, color=colour, fontsize=8, **offset)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -33,7 +32,8 @@ if TYPE_CHECKING:
 SAMPLES = 1200  # of a run
 SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
 SEED = SEEDS["studies"].first  # of a plant's first run, and of the bootstraps
-OSCILLATES = 1.0  # degC by which the swing must exceed that with an idle valve
+PLANTS = 200  # in a random design by default
+OSCILLATES = 1.0  # degC by which the swing must exceed the swing with an idle valve
 COLUMNS = {  # of the overview: headings and formats
     "multiple": ("error ratio, median", "{:.3f}"),
     "multiple_p90": ("error ratio, 90 %", "{:.3f}"),
@@ -43,20 +43,24 @@ COLUMNS = {  # of the overview: headings and formats
 }
 TEXT = (
     "The error ratio is the mean error divided by the least possible error. The table gives "
-    "its median and its 90th percentile over the plants, each with its median run. Travel is "
-    "the valve travel of the median run. A run oscillates if the standard deviation of the "
-    f"error on steady stretches is {OSCILLATES:g} °C larger than with an idle valve. The last "
-    "two columns are shares of the runs."
+    "the median and the 90th percentile of the error ratio over the plants, where a plant has "
+    "the ratio of its median run. Travel is the valve travel of the median run. A run "
+    "oscillates if the standard deviation of the error on steady stretches is "
+    f"{OSCILLATES:g} °C larger than with an idle valve. The last two columns are shares of the "
+    "runs."
 )
 PICTURE = "The error of each controller on each plant, relative to the lowest achievable error"
-GROUPS = {  # of the plants of a random design, a row each
+# Groups of the plants of a random design, by a condition on their arguments. The delays of
+# plants that drift make three groups of about equal size.
+GROUPS = {
     "no drift": "gain_drift.isna()",
     "all that drift": "gain_drift > 0",
     "delay below 14 samples": "gain_drift > 0 and delay < 14",
     "delay from 14 to 22 samples": "gain_drift > 0 and 14 <= delay <= 22",
     "delay above 22 samples": "gain_drift > 0 and delay > 22",
 }
-QUESTIONS = {  # about pairs of controllers: does the first make the smaller error?
+# Questions about pairs of controllers: does the first have the smaller error?
+QUESTIONS = {
     "Does online learning help when the plant drifts?": (
         ("nn", "pi-simc"),
         ("nn", "nn-frozen"),
@@ -77,8 +81,8 @@ DIFFERENCES = "Differences of the mean error (°C), 95 % interval; below 0 the f
 class Options:
     """Run controllers on plants that they were not made for.
 
-    They were made for the paper's plant, or that of --plant, --preset or --set; the design says
-    how the other plants differ from it.
+    They were made for the paper's plant, or for the plant of --plant, --preset or --set. The
+    design says how the other plants differ from this plant.
     """
 
     design: Literal["grid", "random"] = "grid"
@@ -89,64 +93,57 @@ class Options:
     """Seed for the plants of a random design (default: 0)."""
     told: Literal["nominal", "each"] = "nominal"
     """nominal: every controller is made for the one plant above; each: for the plant that it
-    controls, as it is before any drift."""
+    controls, as this plant is before any drift."""
     runs: Runs = 20
     """Runs of a controller on a plant."""
-    agents: AgentNames = tuple(name for name, each in ROSTER.items() if each.swept)
+    agents: AgentNames = tuple(name for name, spec in ROSTER.items() if spec.swept)
     controllers: ControllerOptions = field(default_factory=ControllerOptions)
     plant: PlantOptions = field(default_factory=PlantOptions)
     out: Annotated[Folder | None, Parameter(help="Default: results/sweep-DESIGN.")] = None
 
 
 def work(options: Options) -> str:
-    """Run the sweep and write its results, also after an error: of what has finished."""
-    made_by = chosen(options.agents, options.controllers.agent)
-    members = {name: each.members() for name, each in made_by.items()}
+    """Run the sweep and write its results.
+
+    After an error or an interruption, the results that have finished are written.
+    """
+    controllers = chosen(options.agents, options.controllers.agent)
     nominal = options.plant.arguments()
     plants = design(options, nominal)
-    ranges = ranges_of(plants)
-    made = origin()
-    tasks: dict[str, Any] = {}
-    for i, plant in enumerate(plants):
-        case = {**nominal, **plant, **SETPOINT}
-        tasks[f"plant {i}"] = partial(scale_of, case, options.runs)
-        for name, controllers in members.items():
-            # The plants take the members in turn, so that the maps show how much they differ.
-            member = controllers[i % len(controllers)]
-            prior = {**nominal, **SETPOINT}
-            if "delay_range" in member.prior_knowledge:
-                prior |= ranges
-            if options.told == "each":
-                prior = case
-            tasks[f"plant {i}, {name}"] = partial(run_agent, member, prior, case, options.runs)
+    tasks = tasks_of(options, controllers, nominal, plants)
+    provenance = origin()
     target = options.out or Path(f"results/sweep-{options.design}")
     # The conditions do not cover the code of a user's own controller.
     conditions = None if options.controllers.agent else conditions_of("sweep", options)
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     with results_folder(target, conditions) as folder:
-        kept = KeptResults(folder) if conditions else None
+        finished = KeptResults(folder) if conditions else None
         try:
-            found.update(options.controllers.fan_out.stream(tasks, "sweep", kept))
+            results.update(options.controllers.fan_out.stream(tasks, "sweep", finished))
         finally:
-            runs = table(plants, list(members), found)
-            if missing := len(tasks) - len(found):
-                made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
+            if missing := len(tasks) - len(results):
+                provenance["missing"] = f"{missing} of {len(tasks)} tasks are missing"
+            runs = table(plants, list(controllers), results)
             if not runs.empty:
-                write_json(folder / "provenance.json", made | {"options": asdict(options)})
+                content = {**provenance, "options": asdict(options)}
+                write_json(folder / "provenance.json", content)
                 write_csv(folder / "runs.csv", runs)
                 write_csv(folder / "summary.csv", summarise(runs))
-                report(runs, folder, Parameters(**nominal), made)
+                report(runs, folder, Parameters(**nominal), provenance)
     return f"The report, the data and a map are in {target}/"
 
 
 def design(options: Options, nominal: Arguments) -> list[Arguments]:
-    """Return the arguments in which the plants of the design differ from the nominal one."""
+    """Return the arguments in which the plants of the design differ from the nominal plant.
+
+    A `UsageError` is raised if options contradict each other, or if a plant is invalid.
+    """
     gains = np.linspace(0.75, 1.65, 10).round(6).tolist()
     plants: list[Arguments] = [
         {"delay": delay, "gain_factor": gain} for gain in gains for delay in range(2, 42, 2)
     ]
     if options.design == "random":
-        plants = random_design(options.plants or 200, options.design_seed or 0, SAMPLES)
+        plants = random_design(options.plants or PLANTS, options.design_seed or 0, SAMPLES)
     elif options.plants or options.design_seed is not None:
         raise UsageError("--plants and --design-seed are for --design random")
     with blame(f"--design {options.design}"):
@@ -156,8 +153,33 @@ def design(options: Options, nominal: Arguments) -> list[Arguments]:
     return plants
 
 
+def tasks_of(
+    options: Options,
+    controllers: Mapping[str, ControllerSpec],
+    nominal: Arguments,
+    plants: Sequence[Arguments],
+) -> dict[str, Any]:
+    """Return the tasks by name: "plant 0" for an idle valve, "plant 0, nn" for a controller."""
+    members = {name: controller.members() for name, controller in controllers.items()}
+    ranges = ranges_of(plants)
+    tasks: dict[str, Any] = {}
+    for i, plant in enumerate(plants):
+        case = {**nominal, **plant, **SETPOINT}
+        tasks[f"plant {i}"] = partial(run_idle_valve, case, options.runs)
+        for name, members_of_controller in members.items():
+            # The plants take the members in turn, so that maps show how much members differ.
+            member = members_of_controller[i % len(members_of_controller)]
+            prior = {**nominal, **SETPOINT}
+            if "delay_range" in member.prior_knowledge:
+                prior |= ranges
+            if options.told == "each":
+                prior = case
+            tasks[f"plant {i}, {name}"] = partial(run_agent, member, prior, case, options.runs)
+    return tasks
+
+
 def ranges_of(plants: Sequence[Arguments]) -> Arguments:
-    """Return the ranges of delay and dead zone in a design, where they vary."""
+    """Return the ranges [lowest, highest] of delay and dead zone in a design, if they vary."""
     ranges: Arguments = {}
     for name in ("delay", "dead_zone"):
         values = [plant[name] for plant in plants if name in plant]
@@ -171,8 +193,8 @@ def run_agent(
 ) -> dict[str, Any]:
     """Run a controller on a plant, and return its measures, each of shape (runs,).
 
-    `prior` are the arguments of the plant for which the controller is made, and `case` those of
-    the plant on which it runs.
+    `prior` are the arguments of the plant for which the controller is made, and `case` the
+    arguments of the plant on which it runs. The measures are those of `measure`, and `swing`.
     """
     agent = controller.in_service(prior, runs, SEED)
     trajectory = controller.run(case, SAMPLES, runs, SEED, agent)
@@ -180,20 +202,26 @@ def run_agent(
     return {"run": np.arange(runs), **measures, "swing": swing(trajectory)}
 
 
-def scale_of(case: Arguments, runs: int) -> dict[str, Any]:
-    """Run an idle valve on a plant; add the reference (`limit`), NaN if there is none."""
+def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
+    """Run an idle valve on a plant, and return its measures and the least possible error.
+
+    The measures are those of `run_agent`. The error, `limit`, degC, is the reference; it is NaN
+    if the plant does not settle between changes of the set point.
+    """
     from benchmarks.bounds.least import least_possible
 
-    found = {**run_agent(ROSTER["idle"], case, case, runs), "limit": math.nan}
-    with suppress(NoBoundError):  # the plant does not settle
-        found["limit"] = least_possible(samples=SAMPLES, kind="reference", **case).value
-    return found
+    measures = {**run_agent(ROSTER["idle"], case, case, runs), "limit": math.nan}
+    with suppress(NoBoundError):
+        least = least_possible(samples=SAMPLES, kind="reference", **case)
+        measures["limit"] = least.value
+    return measures
 
 
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Return the error's standard deviation on steady stretches, degC, shape (runs,).
+    """Return the standard deviation of the error on steady stretches, degC, shape (runs,).
 
-    These are the second halves of the stretches of constant set point.
+    Steady stretches are the second halves of the stretches of constant set point. The variances
+    of all steady stretches are averaged.
     """
     errors = trajectory.setpoint - trajectory.output
     variances = [
@@ -206,42 +234,47 @@ def swing(trajectory: Trajectory) -> NDArray[np.float64]:
 def table(
     plants: Sequence[Arguments], agents: Sequence[str], results: Mapping[str, Any]
 ) -> pd.DataFrame:
-    """Return one row for each run that has finished: its plant, measures and comparisons.
+    """Return a row for each run that has finished; without any, the table is empty.
 
-    `results` are the measures by the name of the task, of `scale_of` and `run_agent`.
+    A row has the number and the arguments of the plant, the name of the controller, its
+    measures, and comparisons with an idle valve in the same noise. `results` are those of the
+    tasks of `tasks_of`, by name.
     """
     import pandas as pd
 
     tables = [pd.DataFrame()]
-    for (i, plant), agent in itertools.product(enumerate(plants), agents):
+    for i, plant in enumerate(plants):
         idle = results.get(f"plant {i}")
-        measures = results.get(f"plant {i}, {agent}")
-        if idle and measures:
-            comparisons = {  # with an idle valve in the same noise
-                "limit": idle["limit"],
-                "ratio": measures["mae"] / idle["limit"],
-                "oscillates": measures["swing"] > idle["swing"] + OSCILLATES,
-                "useless": measures["mae"] >= idle["mae"],
-            }
-            columns = {"plant": i, "agent": agent, **measures, **comparisons, **plant}
-            tables.append(pd.DataFrame(columns))
+        for agent in agents:
+            measures = results.get(f"plant {i}, {agent}")
+            if idle and measures:
+                comparisons = {
+                    "limit": idle["limit"],
+                    "ratio": measures["mae"] / idle["limit"],
+                    "oscillates": measures["swing"] > idle["swing"] + OSCILLATES,
+                    "useless": measures["mae"] >= idle["mae"],
+                }
+                columns = {"plant": i, "agent": agent, **measures, **comparisons, **plant}
+                tables.append(pd.DataFrame(columns))
     return pd.concat(tables, ignore_index=True)
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return one row of numbers for each controller; see `TEXT`."""
+    """Return a row for each controller, with the columns of `COLUMNS`; see `TEXT`."""
     by_agent = runs.groupby("agent", sort=False)
-    summary = 100.0 * by_agent[["oscillates", "useless"]].mean()
-    summary.insert(0, "travel", by_agent["total_variation"].median())
-    # Of the median run on each plant.
-    ratios = runs.groupby(["agent", "plant"], sort=False)["ratio"].median().groupby("agent")
-    summary.insert(0, "multiple_p90", ratios.quantile(0.9))
-    summary.insert(0, "multiple", ratios.median())
-    return summary.reset_index()
+    by_plant = runs.groupby(["agent", "plant"], sort=False)
+    ratios = by_plant["ratio"].median().groupby("agent", sort=False)
+    shares = 100.0 * by_agent[["oscillates", "useless"]].mean()
+    travel = by_agent["total_variation"].median()
+    columns = {"multiple": ratios.median(), "multiple_p90": ratios.quantile(0.9)}
+    return shares.assign(**columns, travel=travel)[[*COLUMNS]].reset_index()
 
 
-def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) -> None:
-    """Draw the map, write the report and print it; of plants that drift, with `QUESTIONS`."""
+def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Arguments) -> None:
+    """Draw the picture, write the report and print it.
+
+    If plants drift, the report has a table for each of `QUESTIONS` whose controllers have run.
+    """
     from benchmarks.lib.report import Section, write_report
     from benchmarks.plots.sweep import draw
 
@@ -252,24 +285,27 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, made: Arguments) 
         overview[heading] = overview.pop(name).map(form.format)
     pictures = {"map.png": PICTURE}
     sections = [Section("Errors on other plants", [TEXT], overview, pictures=pictures)]
-    for title, pairs in QUESTIONS.items():
-        asked = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
-        if asked and "gain_drift" in runs and len(compared := differences(runs, asked)):
-            sections.append(Section(title, [DIFFERENCES], compared))
-    write_report(out, "Controllers on other plants", sections, made)
+    if "gain_drift" in runs:
+        for title, pairs in QUESTIONS.items():
+            pairs_that_ran = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
+            if pairs_that_ran and len(compared := differences(runs, pairs_that_ran)):
+                sections.append(Section(title, [DIFFERENCES], compared))
+    write_report(out, "Controllers on other plants", sections, provenance)
 
 
 def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:
-    """Return a table of differences of the mean error, degC, with a row for each group.
+    """Return differences of the mean error in a pair, first minus second, degC, as text.
 
-    Groups are those of `GROUPS` with at least two plants on which all controllers finished.
+    A row is one of `GROUPS` with at least two plants on which all controllers of the pairs have
+    finished; a column is a pair. `runs` is what `table` returns.
     """
     import pandas as pd
 
     from benchmarks.lib.statistics import bootstrap
 
-    agents = list({agent for pair in pairs for agent in pair})
-    errors = runs.pivot(index="plant", columns=["agent", "run"], values="mae")[agents].dropna()
+    agents = {agent for pair in pairs for agent in pair}
+    of_agents = runs[runs["agent"].isin(agents)]
+    errors = of_agents.pivot(index="plant", columns=["agent", "run"], values="mae").dropna()
     plants = runs.drop_duplicates("plant").set_index("plant").loc[errors.index]
     rows = []
     for name, condition in GROUPS.items():

@@ -65,8 +65,8 @@ def change(level, samples, **arguments):
 
 
 def test_responses_to_single_flows_are_those_of_the_plant():
-    found, parameters = course_of(40, delay=3, dead_zone=0.5), Parameters()
-    G = response(*equations(found, 40))
+    model, parameters = course_of(40, delay=3, dead_zone=0.5), Parameters()
+    G = response(*equations(model, 40))
     pulse = signal.lfilter([0.0] * 4 + list(parameters.b), parameters.a, np.eye(40)[0])
     for j in (0, 7, 39):
         np.testing.assert_allclose(G[j:, j], pulse[: 40 - j], atol=1e-12)
@@ -130,9 +130,9 @@ class TestProgramme:
             flow = optimize.lsq_linear(
                 weights[:, np.newaxis] * G, weights * setpoint, limits, "bvls", max_iter=2000
             ).x
-        found = np.abs(setpoint - G @ flow)[1:].sum()
+        error_sum = np.abs(setpoint - G @ flow)[1:].sum()
         least = best_plan(setpoint, **plant)[0][1:].sum()
-        assert least * (1 - 1e-6) <= found < 1.001 * least
+        assert least * (1 - 1e-6) <= error_sum < 1.001 * least
 
     def test_a_controller_that_knows_the_future_attains_the_bound(self):
         # Without a dead zone, so that every flow can be applied; the plant drifts.
@@ -150,10 +150,10 @@ class TestProgramme:
         runs = rollout(make_plants(1, 301, **case), knowing, 300, seed=0)
         of_run = np.abs(setpoint - runs.output[:, 0])
         np.testing.assert_allclose(of_run, error[:-1], atol=1e-4)
-        found = mean_error(runs)
-        assert found[0] == pytest.approx(least.value, rel=1e-4)
-        assert not beats(found * (1 + 1e-4), least)
-        assert beats(found, replace(least, value=1.03 * least.value, episodes=(0.0, 0.0)))
+        run_errors = mean_error(runs)
+        assert run_errors[0] == pytest.approx(least.value, rel=1e-4)
+        assert not beats(run_errors * (1 + 1e-4), least)
+        assert beats(run_errors, replace(least, value=1.03 * least.value, episodes=(0.0, 0.0)))
 
 
 class TestUnknown:
@@ -224,9 +224,9 @@ class TestUnknown:
         model = course_of(620, disturbance_amplitude=3.0, disturbance_interval=10.0)
         latest, earlier = load_changes(model).effects[600:].T
         a, b = np.sort([3.0 * latest, 3.0 * np.maximum(earlier - latest, 0.0)], axis=0)[::-1]
-        found = unknown(model).intercepts[600:, 0]
-        assert np.all(found <= a / 2 + b**2 / (6 * a) + 1e-12)
-        assert np.all(found >= 0.98 * (a / 2 + b**2 / (6 * a)))
+        intercepts = unknown(model).intercepts[600:, 0]
+        assert np.all(intercepts <= a / 2 + b**2 / (6 * a) + 1e-12)
+        assert np.all(intercepts >= 0.98 * (a / 2 + b**2 / (6 * a)))
 
 
 class TestCausal:
@@ -238,8 +238,8 @@ class TestCausal:
         of_plant = course_of(samples, **case)
         law = SetPointLaw(of_plant, unknown(of_plant))
         past = [-4.0] * 3 + [2.0] * 3
-        now = len(past) - 1
-        age = now - past.index(past[-1])
+        present = len(past) - 1
+        age = present - past.index(past[-1])
         penalties = []
         for first, second in itertools.product(range(max(3, age + 1), 8), range(3, 8)):
             for level in np.arange(0.5, 8.0) / 8.0 * 5.0:
@@ -248,7 +248,7 @@ class TestCausal:
                 for sign in (-1, 1):
                     still = past[-1:] * (first - age - 1)
                     setpoint = np.array([*past, *still, *sign * future])[:samples]
-                    penalties.append(law.penalty(setpoint)[now])
+                    penalties.append(law.penalty(setpoint)[present])
         assert abs(np.mean(penalties)) < 0.005 * np.std(penalties)
         assert np.std(penalties) > 0.05
 
@@ -258,10 +258,10 @@ class TestCausal:
             kind: least_possible(samples=400, kind=kind, episodes=4, **arguments)
             for kind in ("preview", "causal")
         }
-        found = errors(CONTROLLERS["mpc"], 4, 400, **arguments)
-        assert not beats(found, kinds["causal"])
+        run_errors = errors(CONTROLLERS["mpc"], 4, 400, **arguments)
+        assert not beats(run_errors, kinds["causal"])
         assert kinds["preview"].value < 0.5 * kinds["causal"].value
-        assert found.mean() < 1.3 * kinds["causal"].value
+        assert run_errors.mean() < 1.3 * kinds["causal"].value
 
 
 class TestLeastPossible:
@@ -277,7 +277,7 @@ class TestLeastPossible:
         with pytest.raises(np.linalg.LinAlgError):
             command.row(Scenario("a", "b", 1201, case), command.Options(episodes=1, seed=0))
         with pytest.raises(np.linalg.LinAlgError):
-            sweep.scale_of({**case, "delay": 17}, 1)
+            sweep.run_idle_valve({**case, "delay": 17}, 1)
 
     def test_score(self):
         least = least_possible(samples=600, setpoint=5.0)
@@ -306,8 +306,8 @@ def test_a_hidden_load_costs_more_than_one_that_is_seen():
     least = least_possible(samples=300, **disturbed)
     assert 1.03 < with_hidden_load(samples=300, **disturbed).value / least.value < 1.15
     # Without noise the output shows the load, and without load there is nothing to hide.
-    seen = {"setpoint": 5.0, "disturbance_amplitude": 1.5}
-    for arguments in (seen, {"setpoint": 5.0, "noise_variance": 0.5}):
+    visible_load = {"setpoint": 5.0, "disturbance_amplitude": 1.5}
+    for arguments in (visible_load, {"setpoint": 5.0, "noise_variance": 0.5}):
         estimate = with_hidden_load(samples=300, **arguments)
         least = least_possible(samples=300, **arguments)
         assert estimate.value == pytest.approx(least.value, abs=1e-4)
@@ -352,8 +352,8 @@ class TestPredictiveController:
     def test_it_reaches_the_limit_without_noise(self, plant):
         case = {"samples": 600, "setpoint": 5.0, **plant}
         limit = least_possible(kind="reference", **case).value
-        (found,) = mean_error(run_mpc(1, **case))
-        assert limit * (1 - 1e-4) <= found <= 1.02 * limit
+        (error,) = mean_error(run_mpc(1, **case))
+        assert limit * (1 - 1e-4) <= error <= 1.02 * limit
 
     def test_it_is_of_minimum_variance_where_nothing_limits_it(self):
         plant = {"a": (1.0, -0.9), "b": (-0.5,), "c": (1.0, 0.8, 0.15), "delay": 3}

@@ -9,7 +9,8 @@ import pandas as pd
 from benchmarks.claims import claims
 from benchmarks.claims.__main__ import main
 from benchmarks.claims.claims import CLAIMS, Claim, converged_at, examined
-from benchmarks.claims.runs import Batch, judge, sections, table, verdict
+from benchmarks.claims.findings import judge, sections, table, verdict
+from benchmarks.claims.runs import Batch
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.rollout import settled
 from tests.conftest import ROOT, trajectory
@@ -19,13 +20,13 @@ GOOD, INFORMATION = {"at_least": 1.0}, {}
 
 def asked(*bounds):
     """Return what is found if a number from 1 to 2 is to keep these bounds."""
-    return [judge("a number", Estimate(1.5, 1.0, 2.0, 1000), **each) for each in bounds]
+    return [judge("a number", Estimate(1.5, 1.0, 2.0, 1000), **limits) for limits in bounds]
 
 
 class TestVerdicts:
     def test_the_whole_interval_must_keep_the_criterion(self):
         both = {"at_least": 0.5, "at_most": 1.9}
-        for bounds, criterion, shown, said in [
+        for bounds, criterion, answer, verdict_in_words in [
             ({"at_least": 0.5}, "at least 0.5", "yes", "holds"),
             ({"at_most": 1.5}, "at most 1.5", "undecided", "does not hold"),
             ({"at_least": 2.5}, "at least 2.5", "no", "does not hold"),
@@ -34,10 +35,10 @@ class TestVerdicts:
             (INFORMATION, "", "", "cannot be tested from the text"),
         ]:
             (finding,) = asked(bounds)
-            assert (finding["criterion"], finding["shown"]) == (criterion, shown)
+            assert (finding["criterion"], finding["shown"]) == (criterion, answer)
             # Information beside it changes nothing, something that is shown does.
-            assert verdict([finding]) == verdict(asked(bounds, INFORMATION)) == said
-            with_good = "holds" if shown in ("yes", "") else "holds in part"
+            assert verdict([finding]) == verdict(asked(bounds, INFORMATION)) == verdict_in_words
+            with_good = "holds" if answer in ("yes", "") else "holds in part"
             assert verdict(asked(bounds, GOOD)) == with_good
 
     def test_the_report_by_hand(self, monkeypatch):
@@ -91,19 +92,19 @@ class TestCommand:
         fails = Claim("", "", "", Mock(side_effect=ArithmeticError("no weights")))
         monkeypatch.setitem(CLAIMS, "noise", fails)
         out = tmp_path / "out"
-        given = ["--jobs", "1", "--runs", "4", "--out", str(out), "noise", "direction"]
-        assert main(given) == 1
+        words = ["--jobs", "1", "--runs", "4", "--out", str(out), "noise", "direction"]
+        assert main(words) == 1
         assert not out.exists()
         folder = tmp_path / "out.unfinished"
-        found = pd.read_csv(folder / "claims.csv")
-        assert set(found["claim"]) == {"direction"}
-        assert found["value"].iloc[1] == 100.0  # all of them diverge in the end ...
-        assert found["shown"].iloc[1] == "undecided"  # ... but four prove little
-        shown = capsys.readouterr().out
-        assert "no weights" in shown
-        for each in (shown, (folder / "report.md").read_text()):
-            assert "Unfinished: 1 of 2 claims are missing." in each
-            assert "Training with -D(G) diverges at once" in each
+        numbers = pd.read_csv(folder / "claims.csv")
+        assert set(numbers["claim"]) == {"direction"}
+        assert numbers["value"].iloc[1] == 100.0  # all of them diverge in the end ...
+        assert numbers["shown"].iloc[1] == "undecided"  # ... but four prove little
+        printed = capsys.readouterr().out
+        assert "no weights" in printed
+        for text in (printed, (folder / "report.md").read_text()):
+            assert "Unfinished: 1 of 2 claims are missing." in text
+            assert "Training with -D(G) diverges at once" in text
 
     def test_short_runs_of_all_claims_give_the_numbers_that_they_gave(self, monkeypatch):
         class Short(Batch):
@@ -112,7 +113,7 @@ class TestCommand:
 
         monkeypatch.setattr(claims, "LEARNING", 30)
         rows = [
-            {"claim": name, **{each: row[each] for each in ("value", "low", "high")}}
+            {"claim": name, **{column: row[column] for column in ("value", "low", "high")}}
             for name in CLAIMS
             for row in examined(name, Short(3, 500))
         ]

@@ -36,23 +36,25 @@ def test_a_set_is_replayed_and_scores_a_learner(minari, tmp_path, capsys):
     assert (dataset.total_episodes, dataset.total_steps) == (4, 4800)
     env = dataset.recover_environment()
     metadata = list(dataset.storage.get_episode_metadata(range(4)))
-    assert [each["controller"] for each in metadata] == ["pi", "pi-simc", "smith", "nn"]
-    for episode, about in zip(dataset, metadata, strict=True):
-        again = run(env, episode.actions[:-1], about["seed"])  # the last one ends the episode
+    controllers = [record["controller"] for record in metadata]
+    assert controllers == ["pi", "pi-simc", "smith", "nn"]
+    for episode, record_of_episode in zip(dataset, metadata, strict=True):
+        seed = record_of_episode["seed"]
+        again = run(env, episode.actions[:-1], seed)  # the last action ends the episode
         assert np.array_equal(again["observation"], episode.observations[:-1])
         assert np.array_equal(again["reward"], episode.rewards[:-1])
-        assert [each.sum() for each in (episode.terminations, episode.truncations)] == [0, 1]
+        assert (episode.terminations.sum(), episode.truncations.sum()) == (0, 1)
         assert np.abs(episode.actions).max() <= 1.0
     # The score of a policy is one number, whoever computes it; and each episode has its own.
-    about = dataset.storage.metadata
-    assert about["behaviour_error"] == -np.mean([episode.rewards for episode in dataset])
-    found = evaluate(lambda seen: -0.2 * seen[:, 3:4], dataset.env_spec, episodes=50)
-    assert list(found.seeds) == about["evaluation_seeds"]
-    assert not {each["seed"] for each in metadata} & set(found.seeds)
-    scored = minari.get_normalized_score(dataset, -1200.0 * found.errors.mean())
-    assert scored == pytest.approx(found.score, abs=1e-12)
-    idle, least = about["idle_error"], about["least_possible_error"]
-    assert (idle - found.mean_error) / (idle - least) == pytest.approx(scored, abs=1e-12)
+    of_set = dataset.storage.metadata
+    assert of_set["behaviour_error"] == -np.mean([episode.rewards for episode in dataset])
+    evaluation = evaluate(lambda seen: -0.2 * seen[:, 3:4], dataset.env_spec, episodes=50)
+    assert list(evaluation.seeds) == of_set["evaluation_seeds"]
+    assert not {record["seed"] for record in metadata} & set(evaluation.seeds)
+    scored = minari.get_normalized_score(dataset, -1200.0 * evaluation.errors.mean())
+    assert scored == pytest.approx(evaluation.score, abs=1e-12)
+    idle, least = of_set["idle_error"], of_set["least_possible_error"]
+    assert (idle - evaluation.mean_error) / (idle - least) == pytest.approx(scored, abs=1e-12)
     assert dataset.recover_environment(eval_env=True).spec == dataset.env_spec
 
 
@@ -81,7 +83,7 @@ HASHES = {
 def test_a_published_set_is_recorded_again_bit_for_bit(plant):
     # If one of these changes, so do the figures on the page, and the set needs a new version.
     sets = (record(plant, behaviour, episodes=4) for behaviour in ("pi", "smith", "mixed"))
-    assert tuple(sha256(plant, each)[:16] for each in sets) == HASHES[plant]
+    assert tuple(sha256(plant, episodes)[:16] for episodes in sets) == HASHES[plant]
 
 
 def test_writing_again_replaces_and_a_failure_changes_nothing(minari, monkeypatch, tmp_path):
@@ -107,8 +109,8 @@ def test_a_full_disk_and_no_home_end_in_a_sentence(minari, tmp_path):
     place = str(tmp_path / "sets")
     environment = {**os.environ, "MINARI_DATASETS_PATH": place}
     environment.pop("HOME", None)
-    given = ["middlepoint/paper/pi-v0", "--episodes", "2"]
-    done = python("-c", program, *given, env=environment)
+    words = ["middlepoint/paper/pi-v0", "--episodes", "2"]
+    done = python("-c", program, *words, env=environment)
     assert (done.returncode, done.stderr) == (1, "")
     assert "pi-v0 could not be written: " in done.stdout
     assert folders(tmp_path) == []

@@ -42,14 +42,14 @@ def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(PPO, "train", lambda _: None)  # it takes most of the time
     for name in ("MiddlePoint-v0", "MiddlePointNoisy-v0"):
         monkeypatch.setattr(gymnasium.spec(name), "max_episode_steps", 60)
-    given = ["page", "--steps", "1", "--seed", "3", "--out", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", given)
+    words = ["page", "--steps", "1", "--seed", "3", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
     runpy.run_path(str(ROOT / "benchmarks/examples/sb3.py"), run_name="__main__")
-    shown = capsys.readouterr().out
-    found = re.search(r"MiddlePointNoisy-v0: mean error ([\d.]+)", shown)
-    kept = load(tmp_path / "ppo-3.zip", device="cpu")
-    noisy = evaluate(kept, spec_of(kept, "MiddlePointNoisy-v0"))
-    assert f"{noisy.mean_error:.3f}" == found[1]
+    printed = capsys.readouterr().out
+    line = re.search(r"MiddlePointNoisy-v0: mean error ([\d.]+)", printed)
+    model = load(tmp_path / "ppo-3.zip", device="cpu")
+    noisy = evaluate(model, spec_of(model, "MiddlePointNoisy-v0"))
+    assert f"{noisy.mean_error:.3f}" == line[1]
 
 
 def test_stable_baselines3_learns_with_the_lines_of_the_page():
@@ -70,10 +70,10 @@ def test_the_notebook_runs_and_shows_what_it_showed(capsys, monkeypatch):
     names: dict[str, object] = {}
     for cell in cells:
         exec("".join(cell["source"]).replace("80_000", "1"), names)  # one rollout
-        shown = capsys.readouterr().out.splitlines()
-        kept = [line for each in cell["outputs"] for line in each.get("text", [])]
-        assert shown[:4] == "".join(kept).splitlines()[:4]  # what needs no training
-    assert shown[4].startswith("PPO")
+        printed = capsys.readouterr().out.splitlines()
+        stored = [line for output in cell["outputs"] for line in output.get("text", [])]
+        assert printed[:4] == "".join(stored).splitlines()[:4]  # the lines before any training
+    assert printed[4].startswith("PPO")
     plt.close("all")
 
 

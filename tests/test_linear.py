@@ -18,8 +18,8 @@ DRIFT = {"gain_drift": 0.6, "time_constant_drift": 1.5, "drift_samples": 90}
 
 def outputs(rng, samples=120, **arguments):
     """Return random flows and what the environment makes of them."""
-    found = run(MiddlePointEnv(**arguments), rng.uniform(-1, 1, samples - 1))
-    return np.append(found["applied"][1:], 0.0), found["output"]
+    record = run(MiddlePointEnv(**arguments), rng.uniform(-1, 1, samples - 1))
+    return np.append(record["applied"][1:], 0.0), record["output"]
 
 
 def response(model, flow, delay):
@@ -34,22 +34,24 @@ def test_the_nominal_model_is_the_environment(rng):
     np.testing.assert_allclose(response(model, flow, 7), output, rtol=0, atol=1e-12)
     assert model.gain == pytest.approx(1.3 * nominal(Parameters()).gain)
     assert model.impulse_response(900).sum() == pytest.approx(model.gain, rel=1e-4)
-    slow, paper = (np.roots([1, *-each.alpha]).max() for each in (model, nominal(Parameters())))
+    slow, paper = (
+        np.roots([1, *-plant.alpha]).max() for plant in (model, nominal(Parameters()))
+    )
     assert 1 - paper == pytest.approx(2.0 * (1 - slow))
 
 
 def test_ranges_stand_for_their_middle_and_what_is_added_does_not_show():
-    more = {"disturbance_amplitude": 1.0, "gain_drift": 0.5}
-    drawn = Parameters(delay=[4, 10], gain_factor=[1.0, 1.6], **more)
+    added = {"disturbance_amplitude": 1.0, "gain_drift": 0.5}
+    drawn = Parameters(delay=[4, 10], gain_factor=[1.0, 1.6], **added)
     middle = Parameters(delay=7, gain_factor=1.3)
     assert step_test(drawn) == step_test(middle)
     np.testing.assert_array_equal(nominal(drawn).beta, nominal(middle).beta)
 
 
 def test_paper_plant_shows_the_numbers_its_controllers_are_tuned_with():
-    found = step_test(Parameters())
+    numbers = step_test(Parameters())
     # Steady-state gain -0.0496 / 0.0727, the time constant of the pole at 0.9515, 19 samples.
-    assert found == {**STEP_TEST, "sampling_interval": 8.0}
+    assert numbers == {**STEP_TEST, "sampling_interval": 8.0}
     slow = step_test(Parameters(sampling_interval=80.0))
     assert [*slow.values()] == [-0.6825, 1610.0, 1520.0, 80.0]
 
@@ -60,10 +62,10 @@ def test_paper_plant_shows_the_numbers_its_controllers_are_tuned_with():
 def test_plant_of_first_order_shows_its_own_numbers(gain, time_constant, delay):
     pole = np.exp(-8.0 / time_constant)
     plant = Parameters(a=[1.0, -pole], b=[gain * (1.0 - pole)], delay=delay - 1)
-    found = step_test(plant)
-    assert found["gain"] == pytest.approx(gain, rel=1e-3)
-    assert found["time_constant"] == pytest.approx(time_constant, rel=0.01, abs=1.0)
-    assert found["delay"] == 8.0 * delay
+    numbers = step_test(plant)
+    assert numbers["gain"] == pytest.approx(gain, rel=1e-3)
+    assert numbers["time_constant"] == pytest.approx(time_constant, rel=0.01, abs=1.0)
+    assert numbers["delay"] == 8.0 * delay
 
 
 def test_plant_without_a_new_steady_state_is_refused():
@@ -154,9 +156,11 @@ class TestLoop:
         def simc(time_constant):
             return PIController.simc(**STEP_TEST, closed_loop_time_constant=time_constant)
 
-        found = time_constant_for(1.6, simc, plant, 5000.0, 1.0)
-        assert LinearLoop.of(simc(found), plant).sensitivity() == pytest.approx(1.6, rel=1e-4)
-        assert time_constant_for(1.7, simc, plant, 5000.0, 1.0) < found
+        time_constant_found = time_constant_for(1.6, simc, plant, 5000.0, 1.0)
+        assert LinearLoop.of(simc(time_constant_found), plant).sensitivity() == pytest.approx(
+            1.6, rel=1e-4
+        )
+        assert time_constant_for(1.7, simc, plant, 5000.0, 1.0) < time_constant_found
         assert time_constant_for(1.6, simc, plant, 5000.0, 200.0) == 200.0  # none is too fast
         with pytest.raises(ValueError, match=r"no time constant up to 10 s .* Ms of 1\.6"):
             time_constant_for(1.6, simc, plant, 10.0, 1.0)

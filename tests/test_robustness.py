@@ -14,8 +14,8 @@ from mptc_gym.evaluation import SEED
 
 def test_table_and_picture_are_of_rules_at_one_sensitivity(tmp_path, monkeypatch):
     monkeypatch.setattr(robustness, "SENSITIVITIES", (1.4, ROBUSTNESS))
-    given = f"--runs 2 --jobs 1 --out {tmp_path}"
-    assert robustness.main(given.split()) == 0
+    words = f"--runs 2 --jobs 1 --out {tmp_path}"
+    assert robustness.main(words.split()) == 0
     rows = pd.read_csv(tmp_path / "robustness.csv")
     assert len(rows) == 3 * 2 * len(robustness.CASES)
     for (name, ms), of_rule in rows.groupby(["agent", "Ms"]):

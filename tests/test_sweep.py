@@ -34,7 +34,7 @@ def test_around_another_plant_a_design_spans_its_own_numbers():
 
 def test_a_plant_that_does_not_settle_has_no_limit():
     limits = [
-        sweep.scale_of({"setpoint": "square", "setpoint_period": period}, 1)["limit"]
+        sweep.run_idle_valve({"setpoint": "square", "setpoint_period": period}, 1)["limit"]
         for period in (600, 38)
     ]
     assert limits == [pytest.approx(0.911, abs=0.001), pytest.approx(np.nan, nan_ok=True)]
@@ -43,8 +43,8 @@ def test_a_plant_that_does_not_settle_has_no_limit():
 def run_sweep(tmp_path, options, status=0):
     """Run a sweep and return its runs, which stay apart if it has not finished."""
     out = tmp_path / "out"
-    given = f"--design random --plants 4 --runs 2 --jobs 1 {options} --out {out}"
-    assert main(given.split()) == status
+    words = f"--design random --plants 4 --runs 2 --jobs 1 {options} --out {out}"
+    assert main(words.split()) == status
     folder = out.with_name("out.unfinished") if status else out
     return pd.read_csv(folder / "runs.csv")
 
@@ -62,8 +62,8 @@ class TestCommand:
         monkeypatch.setattr(least, "least_possible", lambda **_: Mock(value=1.0))
 
     def test_random_design(self, tmp_path, capsys):
-        given = "--design-seed 2026 --agents nn nn-frozen pi-simc"
-        runs = run_sweep(tmp_path, given)
+        options = "--design-seed 2026 --agents nn nn-frozen pi-simc"
+        runs = run_sweep(tmp_path, options)
         golden = pd.read_csv(ROOT / "tests/golden/sweep.csv")
         pd.testing.assert_frame_equal(runs, golden, rtol=1e-8, atol=1e-8)
         out = tmp_path / "out"
@@ -79,26 +79,26 @@ class TestCommand:
     @pytest.mark.usefixtures("quick")
     def test_what_the_options_change(self, tmp_path):
         first = run_sweep(tmp_path, "--agents smith")
-        for more in ("--design-seed 1", "--set dead_zone=4"):
-            other = run_sweep(tmp_path, f"--agents smith {more}")
-            assert not other["mae"].equals(first["mae"]), more
+        for added in ("--design-seed 1", "--set dead_zone=4"):
+            other = run_sweep(tmp_path, f"--agents smith {added}")
+            assert not other["mae"].equals(first["mae"]), added
         # If it knows each plant, a controller does better.
-        told = run_sweep(tmp_path, "--agents smith --told each")
-        assert told["mae"].mean() < first["mae"].mean() - 0.05
+        informed = run_sweep(tmp_path, "--agents smith --told each")
+        assert informed["mae"].mean() < first["mae"].mean() - 0.05
 
     @pytest.mark.usefixtures("quick")
     def test_a_function_acts_in_each_plant_as_its_code_is_now(self, tmp_path, monkeypatch):
         monkeypatch.syspath_prepend(tmp_path)
         # Bytecode is told from an older one of the same second by its size alone.
         monkeypatch.setattr(sys, "dont_write_bytecode", True)
-        found = []
+        runs_by_gain = []
         for gain in (-0.1, -0.2):
             monkeypatch.delitem(sys.modules, "own_law", raising=False)
             code = f"def law():\n    return lambda seen: {gain} * seen[:, 3:4]\n"
             (tmp_path / "own_law.py").write_text(code)
             importlib.invalidate_caches()
-            found.append(run_sweep(tmp_path, "--agents pi --agent mine=own_law:law"))
-        assert not found[0]["mae"].equals(found[1]["mae"])
+            runs_by_gain.append(run_sweep(tmp_path, "--agents pi --agent mine=own_law:law"))
+        assert not runs_by_gain[0]["mae"].equals(runs_by_gain[1]["mae"])
 
     @pytest.mark.usefixtures("quick")
     @pytest.mark.parametrize(
@@ -138,13 +138,13 @@ def test_differences_of_runs_made_up_so_that_the_answer_is_known():
     worse = (runs["agent"] == "nn") & (runs["delay"] == 13)
     runs["mae"] = np.where(runs["agent"] == "nn", 1.0, 1.5) + 2.0 * worse
     table = sweep.differences(runs, [("nn", "pi-simc")])
-    found = table.set_index("plants")["NN (1992) - PI (SIMC)"].to_dict()
-    assert found.pop("all that drift").startswith("+0.500 (")
+    by_group = table.set_index("plants")["NN (1992) - PI (SIMC)"].to_dict()
+    assert by_group.pop("all that drift").startswith("+0.500 (")
     below, above = "delay below 14 samples", "delay above 22 samples"
-    assert found == {"no drift": "-0.500", below: "+1.500", above: "-0.500"}
+    assert by_group == {"no drift": "-0.500", below: "+1.500", above: "-0.500"}
     assert table["number"].tolist() == ["10", "20", "10", "10"]
     # Plants where one of them has failed do not count, and one plant is no group.
     failed = (runs["agent"] == "nn") & (runs["plant"] > 1)
-    found = sweep.differences(runs[~failed], [("nn", "pi-simc")])
-    assert found["number"].tolist() == ["2"]
+    table = sweep.differences(runs[~failed], [("nn", "pi-simc")])
+    assert table["number"].tolist() == ["2"]
     assert sweep.differences(runs[runs["plant"] == 0], [("nn", "pi-simc")]).empty

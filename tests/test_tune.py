@@ -25,13 +25,11 @@ class TestScore:
         assert not any(case.arguments in compared for case in tune.CASES.values())
 
     def test_no_control_pays_for_not_settling(self):
-        found = tune.score("pi", {}, 2, 0, {"kp": 0.0, "ki": 0.0})
-        assert found["constant"] == pytest.approx(4.8)  # all of the set point, all the time
-        assert found["learnt"] == pytest.approx(5.2)
-        assert found["not converged"] == 1.0
-        assert found["objective"] == pytest.approx(
-            np.mean([found[c] for c in tune.CASES]) + 5.0
-        )
+        row = tune.score("pi", {}, 2, 0, {"kp": 0.0, "ki": 0.0})
+        assert row["constant"] == pytest.approx(4.8)  # all of the set point, all the time
+        assert row["learnt"] == pytest.approx(5.2)
+        assert row["not converged"] == 1.0
+        assert row["objective"] == pytest.approx(np.mean([row[c] for c in tune.CASES]) + 5.0)
 
 
 @pytest.fixture
@@ -46,8 +44,8 @@ def short(monkeypatch):
 
 def search(out, runs=2, status=0):
     """Run a search, and return its trials, which stay apart if it has not finished."""
-    given = f"pi --trials 6 --runs {runs} --out {out}"
-    assert tune.main(given.split()) == status
+    words = f"pi --trials 6 --runs {runs} --out {out}"
+    assert tune.main(words.split()) == status
     folder = out / "pi.unfinished" if status else out / "pi"
     return pd.read_csv(folder / "trials.csv")
 
@@ -67,14 +65,14 @@ class TestOtherPlants:
         assert tune.spans_of(ROSTER["nn"], {}) == NN_SPANS
 
     def test_cases_and_spans_scale_with_the_plant(self):
-        found = tune.cases(self.PLANT)
-        learnt, quiet = (Parameters(**found[name].arguments) for name in ("learnt", "constant"))
+        cases = tune.cases(self.PLANT)
+        learnt, quiet = (Parameters(**cases[name].arguments) for name in ("learnt", "constant"))
         assert (learnt.setpoint_amplitude, learnt.setpoint_period) == (10.4, 280)
         assert learnt.disturbance_amplitude == 2.0
         assert (quiet.setpoint, quiet.noise_variance, quiet.is_disturbed) == (9.6, 0.0, False)
-        assert found["learnt"].samples == 1120
-        assert found["dead zone"].arguments["dead_zone"] == pytest.approx(3.9)
-        assert found["noise"].arguments["noise_variance"] == pytest.approx(0.8)
+        assert cases["learnt"].samples == 1120
+        assert cases["dead zone"].arguments["dead_zone"] == pytest.approx(3.9)
+        assert cases["noise"].arguments["noise_variance"] == pytest.approx(0.8)
         # Twice the gain, of the other sign: half the gains of the controller, likewise.
         low, high = tune.spans_of(ROSTER["pi"], self.PLANT)["kp"]
         assert (low, high) == pytest.approx((-0.05, -5.0))
@@ -83,8 +81,8 @@ class TestOtherPlants:
 def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path):
     plant = tmp_path / "plant.json"
     plant.write_text(json.dumps({"b": [0.0456, 0.00404]}))
-    given = f"pi --trials 3 --runs 2 --plant {plant} --out {tmp_path}"
-    assert tune.main(given.split()) == 0
+    words = f"pi --trials 3 --runs 2 --plant {plant} --out {tmp_path}"
+    assert tune.main(words.split()) == 0
     file = tmp_path / "pi/gains.json"
     gains = json.loads(file.read_text())["gains"]
     assert gains["kp"] < 0.0
@@ -118,7 +116,7 @@ class TestSearch:
             assert np.isclose(trials["objective"], in_search, rtol=1e-3).any()
 
     def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch, capsys):
-        whole, judge, calls = search(tmp_path / "whole"), tune.settled, []
+        uninterrupted, judge, calls = search(tmp_path / "whole"), tune.settled, []
 
         def settled(runs):  # called once a trial
             calls.append(runs)
@@ -130,7 +128,7 @@ class TestSearch:
         assert len(search(tmp_path / "halves", status=130)) == 4
         assert "Interrupted" in capsys.readouterr().out
         assert not (tmp_path / "halves/pi").exists()
-        assert search(tmp_path / "halves").equals(whole)
+        assert search(tmp_path / "halves").equals(uninterrupted)
         assert len(calls) == 5 + 2 + 2  # the first four are kept; the last two are finalists
 
     def test_one_that_is_stopped_before_its_first_trial_changes_nothing(
@@ -157,6 +155,6 @@ class TestSearch:
 def test_the_pages_of_the_searches_name_the_defaults():
     pages = (ROOT / f"benchmarks/published/tune_{name}.md" for name in ("nn", "pi"))
     nn, pi = (page.read_text(encoding="utf-8") for page in pages)
-    own = DirectNNController()
-    assert f"({', '.join(f'{name} {getattr(own, name):g}' for name in NN_SPANS)})" in nn
+    paper = DirectNNController()
+    assert f"({', '.join(f'{name} {getattr(paper, name):g}' for name in NN_SPANS)})" in nn
     assert "gains, {kp:g} and {ki:g}, are".format(**SEARCHED_GAINS) in pi

@@ -4,7 +4,7 @@ from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """Import `least_possible` when it is used, as SciPy loads more slowly than a help text."""
+    """Import `least_possible` on its first use, as SciPy loads more slowly than a help text."""
     if name != "least_possible":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from benchmarks.bounds.least import least_possible

@@ -2,6 +2,7 @@
 
 import shutil
 import textwrap
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -21,23 +22,24 @@ from mptc_gym.evaluation import (
 )
 
 HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
-HIDDEN = "hidden load (estimate)"
 NOTE = (
     "'With preview' is a lower bound for every controller, even one that knows all set points "
-    "in advance. 'Without preview' is a lower bound for controllers that see a change only "
-    "when it happens; it exists for random set points, whose distribution is known. "
-    "'Reference' is the lowest error if the plant has settled before each change and the "
-    "change comes as a surprise; a controller that knows when the changes come can do better. "
-    "If the set point never changes, the three are the same. All of them assume that the "
+    "in advance. 'Without preview' is a lower bound for controllers that see a change of the "
+    "set point only when it happens; it exists for random set points, whose distribution is "
+    "known. 'Reference' is the lowest error if the plant has settled before each change and "
+    "the change comes as a surprise; a controller that knows when the changes come can do "
+    "better. If the set point never changes, the three are the same. All three assume that the "
     "controller knows the present load. 'Hidden load' is an estimate, and no bound, for "
     "controllers that see the load only through the transmitter. Intervals are 95 % intervals "
     "over sampled episodes."
 )
 PACKAGE = ROOT / "mptc_gym" / "bounds.json"
-MORE = 20  # episodes of the package beyond the `EPISODES` of a published score
+# The package has the bounds of this many episodes after the `EPISODES` of a published score, so
+# that a somewhat longer evaluation can be compared with bounds, too.
+MORE_EPISODES = 20
 PACKAGED = PRESETS | {
     f"{name}, random set points": {**PRESETS[name], "setpoint": "random"}
-    for name in ("paper", "disturbed", "fouling")  # for the data sets
+    for name in ("paper", "disturbed", "fouling")  # the plants of the data sets
 }
 
 
@@ -46,7 +48,7 @@ PACKAGED = PRESETS | {
 class Options:
     """Print the least possible mean error of each case.
 
-    The cases are those of the comparison and the presets, or those of another plant.
+    The cases are those of the comparison and the presets, or the cases of another plant.
     """
 
     mpc: Runs | None = None
@@ -56,7 +58,7 @@ class Options:
     fan_out: FanOut = field(default_factory=FanOut)
     plant: PlantOptions = field(default_factory=PlantOptions)
     samples: Count | None = None
-    """Length of an episode, samples (default: that of the case)."""
+    """Length of an episode, samples (default: the length of the case)."""
     episodes: Count = EPISODES
     """Episodes to average a bound over, where plants or set points are drawn."""
     seed: Seed = SEED
@@ -64,35 +66,33 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Print the bounds of the cases and of the presets, or of another plant."""
+    """Print the bounds of the cases and of the presets, or of another plant.
+
+    After an error or an interruption the cases that have finished are printed.
+    """
+    import pandas as pd
+
+    from benchmarks.lib.report import on_screen
+
     cases = options.plant.cases(SCENARIOS | PRESET_SCENARIOS)
     if options.package:
         return write_package(options.fan_out)
     tasks = {name: partial(row, case, options) for name, case in cases.items()}
-    headings = ["idle valve", *HEADINGS.values(), HIDDEN]
-    if options.mpc:
-        headings.append("MPC")
     print(", ".join(filter(None, ["Mean |e| in °C", options.plant.name])) + ":")
-    rows: dict[str, list[str]] = {}
+    rows: dict[str, dict[str, str]] = {}
     try:
         rows.update(options.fan_out.stream(tasks, "bounds"))
     finally:
-        _print_row("", headings)
-        for name in tasks:
-            if name in rows:
-                _print_row(name, rows[name])
+        if rows:
+            table = pd.DataFrame([rows[name] for name in tasks if name in rows])
+            print(on_screen(table), flush=True)
     return "\n" + textwrap.fill(NOTE, shutil.get_terminal_size((150, 24)).columns)
 
 
-def _print_row(name: str, cells: list[str]) -> None:
-    columns = "".join(f"{cell:>26}" for cell in cells)
-    print(f"{name:20}{columns}".rstrip(), flush=True)
+def row(case: Scenario, options: Options) -> dict[str, str]:
+    """Return the name of a case and its errors, degC, as text by the headings of the table.
 
-
-def row(case: Scenario, options: Options) -> list[str]:
-    """Return the errors of a case as text, in the order of the headings.
-
-    A cell is empty if the case has no bound of its kind, or no load to estimate.
+    A cell is empty if the case has no bound of this kind, or no load to estimate.
     """
     from benchmarks.bounds.least import least_possible, with_hidden_load
     from benchmarks.controllers.roster import ROSTER
@@ -106,37 +106,30 @@ def row(case: Scenario, options: Options) -> list[str]:
         "seed": options.seed,
         **case.arguments,
     }
-    cells = [f"{least_possible(kind='preview', **arguments).idle:.4f}"]
-    cells += [_bound(kind, arguments) for kind in HEADINGS]
+    cells = {"case": case.name}
+    cells["idle valve"] = f"{least_possible(kind='preview', **arguments).idle:.4f}"
+    for kind, heading in HEADINGS.items():
+        cells[heading] = ""
+        with suppress(NoBoundError):
+            cells[heading] = f"{least_possible(kind=kind, **arguments):.4f}"
+    cells["hidden load (estimate)"] = ""
     if case.parameters.is_disturbed:
-        cells.append(f"{with_hidden_load(**arguments):.4f}")
-    else:
-        cells.append("")
+        cells["hidden load (estimate)"] = f"{with_hidden_load(**arguments):.4f}"
     if options.mpc:
         runs = ROSTER["mpc"].run(case.arguments, samples, options.mpc, options.seed)
-        cells.append(f"{bootstrap(mean_error(runs), seed=0):.4f}")
+        cells["MPC"] = f"{bootstrap(mean_error(runs), seed=0):.4f}"
     return cells
 
 
-def _bound(kind: str, arguments: dict[str, Any]) -> str:
-    """Return a bound as text, empty if the case has none of this kind."""
-    from benchmarks.bounds.least import least_possible
-
-    try:
-        return f"{least_possible(kind=kind, **arguments):.4f}"
-    except NoBoundError:
-        return ""
-
-
 def write_package(fan_out: FanOut) -> str:
-    """Write the least possible error of each case, for every episode where they differ.
+    """Write the least possible error of each case, for each episode where they differ.
 
-    Each case has the bounds of the published episodes, "least". Where bounds differ, it also
-    has those of the episodes to choose policies by, "validation_least".
+    Each case has the bounds of the published episodes, "least". Where bounds differ between
+    episodes, it also has the bounds of the episodes to choose policies by, "validation_least".
     """
     from benchmarks.bounds.least import least_possible
 
-    published: dict[str, Any] = {"seed": SEED, "episodes": EPISODES + MORE}
+    published: dict[str, Any] = {"seed": SEED, "episodes": EPISODES + MORE_EPISODES}
     validation: dict[str, Any] = {"seed": VALIDATION_SEED, "episodes": VALIDATION_EPISODES}
     tasks = {
         name: partial(least_possible, samples=SAMPLES, **published, **arguments)

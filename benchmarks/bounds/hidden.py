@@ -2,14 +2,14 @@
 
 The bounds assume that the load is known up to k - d - 1. A controller has only the readings of
 the transmitter, in which noise hides the load. No bound is known that counts this, so it is
-estimated, and shown beside the bound under this name.
+estimated, and reports show the estimate beside the bound under the name "hidden load".
 
 The estimate treats the load as normal, with the variances and correlations that it has. Then
 the unknown part of y(k) is normal, too, with a variance that the Kalman filter gives, and the
 least possible error follows as in `linear_program.py`: once with the load known up to
-k - d - 1, once with readings alone. The difference of the two is added to the bound. Both
-overestimate a load that jumps, which is zero most of the time and large otherwise; in their
-difference this cancels for the greater part.
+k - d - 1, once with readings alone. The difference of the two errors is added to the bound.
+Both errors are too large for a load that jumps, which is zero most of the time and large
+otherwise; in their difference this cancels for the greater part.
 """
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.bounds.linear_program import Unknown
 from benchmarks.bounds.unknown import (
     filtered_covariance,
+    noise_system,
     predicted_variance,
     unknown_of_normal,
 )
@@ -26,17 +27,18 @@ from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
+STEPS, WALK = -2, -1  # places of the two parts of the load in the state
+
 
 def unknown_of_normal_load(model: LinearModel) -> Unknown:
     """Return what remains unknown if the load is normal, and known up to k - d - 1."""
     F, Q = _with_load(model)
-    known_load = np.zeros_like(F)
+    filtered = np.zeros_like(F)  # a known load has no variance
     if model.numbers.measurement_noise_variance > 0.0:
-        F_noise, Q_noise = F[:, :-2, :-2], _noise_covariance(model)
-        known_load[:, :-2, :-2] = filtered_covariance(
-            F_noise, Q_noise, model.numbers.measurement_noise_variance
+        filtered[:, :STEPS, :STEPS] = filtered_covariance(
+            *noise_system(model), model.numbers.measurement_noise_variance
         )
-    return unknown_of_normal(predicted_variance(known_load, F, Q, model.lag))
+    return unknown_of_normal(predicted_variance(filtered, F, Q, model.lag))
 
 
 def unknown_of_hidden_load(model: LinearModel) -> Unknown:
@@ -46,45 +48,39 @@ def unknown_of_hidden_load(model: LinearModel) -> Unknown:
     return unknown_of_normal(predicted_variance(filtered, F, Q, model.lag))
 
 
-def _noise_covariance(model: LinearModel) -> Array:
-    """Return the covariance of what xi(k) adds to the state of (28), for all k."""
-    _, enters = model.state_space()
-    covariance = model.numbers.noise_variance * np.outer(enters, enters)
-    return np.broadcast_to(covariance, (len(model.load), *covariance.shape))
-
-
 def _with_load(model: LinearModel) -> tuple[Array, Array]:
-    """Return F(k) and Q(k) of the state of (28) followed by the load's steps and its walk.
+    """Return F(k) and Q(k) of the state of (28), followed by the load's steps and its walk.
 
-    Both have the shape (samples, size, size).
+    x(k) = F(k) x(k-1) + a noise with the covariance Q(k). Both have the shape (samples, size,
+    size). The load, degC, is the sum of the steps and the walk.
     """
-    samples, numbers = len(model.load), model.numbers
-    F_noise, _ = model.state_space()
+    numbers = model.numbers
+    F_noise, Q_noise = noise_system(model)
+    samples = len(F_noise)
     size = F_noise.shape[-1] + 2
-    steps, walk = size - 2, size - 1  # places of the two parts of the load
     k = np.arange(samples)
-    changes = (k % LOAD_INTERVAL == 0) & (k > 0)
-    jump = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval)
-    stays = np.where(changes, 1.0 - jump, 1.0)  # of a level, in the mean
+    is_change = (k % LOAD_INTERVAL == 0) & (k > 0)
+    jump = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval)  # probability
+    stays = np.where(is_change, 1.0 - jump, 1.0)  # mean of a level, as a share of the level
 
     F = np.zeros((samples, size, size))
-    F[:, :-2, :-2] = F_noise
-    F[:, steps, steps] = stays
-    F[:, walk, walk] = 1.0
-    F[:, 0, steps] = model.load * stays
-    F[:, 0, walk] = model.load
+    F[:, :STEPS, :STEPS] = F_noise
+    F[:, STEPS, STEPS] = stays
+    F[:, WALK, WALK] = 1.0
+    F[:, 0, STEPS] = model.load * stays
+    F[:, 0, WALK] = model.load
 
     # The level is 0 until the first jump, and uniform from then on.
-    jumped = 1.0 - np.cumprod(stays)
-    level_variance = jumped * numbers.disturbance_amplitude**2 / 3.0
-    earlier_variance = np.append(0.0, level_variance[:-1])
-    step_variance = level_variance - np.square(stays) * earlier_variance
-    walk_variance = changes * LOAD_INTERVAL * numbers.disturbance_walk_variance
+    has_jumped = 1.0 - np.cumprod(stays)  # probability
+    level_variance = has_jumped * numbers.disturbance_amplitude**2 / 3.0
+    variance_before = np.append(0.0, level_variance[:-1])
+    step_variance = level_variance - np.square(stays) * variance_before
+    walk_variance = is_change * LOAD_INTERVAL * numbers.disturbance_walk_variance
     Q = np.zeros((samples, size, size))
-    Q[:, :-2, :-2] = _noise_covariance(model)
-    for place, variance in ((steps, step_variance), (walk, walk_variance)):
-        enters = np.zeros((samples, size))  # a change of this part enters the state so
+    Q[:, :STEPS, :STEPS] = Q_noise
+    for part, variance in ((STEPS, step_variance), (WALK, walk_variance)):
+        enters = np.zeros((samples, size))  # how a change of this part enters the state
         enters[:, 0] = model.load
-        enters[:, place] = 1.0
+        enters[:, part] = 1.0
         Q += variance[:, np.newaxis, np.newaxis] * np.einsum("ki,kj->kij", enters, enters)
     return F, Q

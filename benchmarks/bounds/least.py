@@ -1,22 +1,24 @@
 """Compute the least possible mean error of any case of the environment, and scores from it.
 
-README.md says what each kind holds for. The mean error is that of the rewards, of |e(k)| over
-k = 1 to N. A controller at k may know the transmitter's readings up to k, and perhaps any set
-points, plant numbers and loads up to k, but neither the true output, `info["output"]`, nor when
-the load jumps next. It may undo the dead zone.
+README.md says for which controllers each kind of bound holds. The mean error is the mean of
+|e(k)| over k = 1 to N, the samples that have rewards. A controller at k may know the
+transmitter's readings up to k, and perhaps any set points, plant numbers and loads up to k, but
+neither the true output, `info["output"]`, nor when the load jumps next. It may undo the dead
+zone.
 """
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.hidden import unknown_of_hidden_load, unknown_of_normal_load
-from benchmarks.bounds.linear_program import SMOOTH, TAIL, Unknown, plan, reference
+from benchmarks.bounds.linear_program import TAIL, TRAVEL_PRICE, Unknown, plan, reference
 from benchmarks.bounds.unknown import unknown
 from benchmarks.lib.errors import NoBoundError
 from benchmarks.lib.statistics import Estimate, student
@@ -47,19 +49,20 @@ class LeastPossible(Estimate):
 
     kind: str  # one of `KINDS`
     idle: Estimate  # mean |e| of the same episodes with an idle valve, degC
-    # Terms of the mean, degC; element i is for the episode of seed `seed + i`. For the kind
-    # "causal" only their mean is a bound.
+    # The terms of which `value` is the mean, degC: term i belongs to the episode of seed
+    # `seed + i`. For the kind "causal" a term alone is no bound. There is one term if the bound
+    # is the same for all episodes.
     episodes: tuple[float, ...]
 
     def score(self, errors: ArrayLike) -> Array:
         """Return scores of mean errors, degC: 0 for an idle valve, 1 for `value`.
 
-        A single run may exceed 1 by chance. A ValueError is raised if nothing is better than no
-        control.
+        The score of a single run may exceed 1 by chance. A ValueError is raised if no
+        controller is better than an idle valve.
         """
         idle = self.idle.value
         if idle - self.value <= 1e-9 * max(idle, 1.0):
-            raise ValueError(f"there is nothing to gain: doing nothing gives {idle:g} °C")
+            raise ValueError(f"there is nothing to gain: an idle valve gives {idle:g} °C")
         scores: Array = (idle - np.asarray(errors, np.float64)) / (idle - self.value)
         return scores
 
@@ -77,12 +80,11 @@ def least_possible(
     Parameters
     ----------
     samples
-        N, length of an episode.
+        N, the length of an episode.
     kind
-        One of `KINDS`: "causal" is for random set points alone, "reference" for those that the
-        plant settles at before they change; otherwise a `NoBoundError` is raised. None chooses
-        as reports and `mptc_gym.evaluate` do: "causal" for random set points; otherwise
-        "reference", or "preview" if there is none or if the set point never changes.
+        One of `KINDS`. None chooses as reports and `mptc_gym.evaluate` do: "causal" for random
+        set points; otherwise "reference", or "preview" if the case has no reference or if the
+        set point never changes.
     episodes
         Number of episodes, if anything is drawn.
     seed
@@ -95,7 +97,7 @@ def least_possible(
     ------
     NoBoundError
         If the case has no bound of this kind: "causal" is for random set points alone,
-        "reference" for those that the plant settles at before they change.
+        "reference" for set points that hold until the plant has settled.
     ValueError
         If an argument is out of its range.
     """
@@ -105,24 +107,24 @@ def least_possible(
             raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
     if kind is not None and kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
-    of_kind = partial(_least_possible, parameters, samples, episodes, seed)
-    random_setpoint = parameters.setpoint == "random"
-    if kind == "causal" and not random_setpoint:
+    has_law = parameters.setpoint == "random"
+    if kind == "causal" and not has_law:
         raise NoBoundError(
             f"kind must be preview or reference, as the set point {parameters.setpoint!r} has "
             f"no law, got {kind!r}"
         )
+    case = parameters, samples, episodes, seed
     if kind is not None:
-        return of_kind(kind)
-    if random_setpoint:
-        return of_kind("causal")
-    # Foresight makes no difference where nothing changes.
-    if np.ptp(_draw(parameters, samples, 1, seed).setpoints) == 0.0:
-        return of_kind("preview")
+        return _bound(*case, kind)
+    if has_law:
+        return _bound(*case, "causal")
+    (setpoint,) = _draw(parameters, samples, 1, seed).setpoints
+    if np.ptp(setpoint) == 0.0:  # Without a change, foresight makes no difference.
+        return _bound(*case, "preview")
     try:
-        return of_kind("reference")
+        return _bound(*case, "reference")
     except NoBoundError:  # the plant does not settle between changes
-        return of_kind("preview")
+        return _bound(*case, "preview")
 
 
 def with_hidden_load(
@@ -145,26 +147,26 @@ def with_hidden_load(
     if not parameters.is_disturbed:
         return least
     drawn = _draw(parameters, samples, len(least.episodes), seed)
-    added = [
-        _least(parameters, least.kind, numbers, setpoint, unknown_of_hidden_load)
-        - _least(parameters, least.kind, numbers, setpoint, unknown_of_normal_load)
-        for numbers, setpoint in zip(drawn.numbers, drawn.setpoints, strict=True)
-    ]
-    return student(np.array(least.episodes) + np.array(added) / samples)
+    estimates = []
+    for i, bound in enumerate(least.episodes):
+        episode = parameters, least.kind, drawn.numbers[i], drawn.setpoints[i]
+        hidden_load = _error_sum(*episode, unknown_of_hidden_load)
+        known_load = _error_sum(*episode, unknown_of_normal_load)
+        estimates.append(bound + (hidden_load - known_load) / samples)
+    return student(estimates)
 
 
 class _Episodes(NamedTuple):
-    """What the environment draws for some episodes."""
+    """What the environment draws for some episodes of N samples."""
 
-    numbers: Sequence[PlantNumbers[float]]
-    setpoints: Array
-    """y_d(k) for k = 0 to N, degC, shape (episodes, N + 1)."""
+    numbers: Sequence[PlantNumbers[float]]  # the plant numbers of each episode
+    setpoints: Array  # y_d(k) for k = 0 to N, degC, shape (episodes, N + 1)
+    # Mean |e(k)| over k = 1 to N with an idle valve, degC, shape (episodes,).
     idle_errors: Array
-    """Mean |e(k)| over k = 1 to N with the valve left alone, degC, shape (episodes,)."""
 
 
 def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
-    """Return the episodes that the environment draws."""
+    """Return the episodes of seeds `seed` to `seed + episodes - 1`, of `samples` samples."""
     numbers = drawn_numbers(parameters, episodes, seed)
     with closing(make_plants(episodes, samples + 1, **asdict(parameters))) as plants:
         idle_valve = IdleValve(numbers.u_min, numbers.u_max)
@@ -177,47 +179,62 @@ def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Ep
 
 
 @cache  # as a report asks for several kinds of a case
-def _least_possible(
+def _bound(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
-    drawn = _draw(parameters, samples, episodes if is_random(parameters) else 1, seed)
-    # Where noise and load alone are drawn, the bound is the same for all episodes.
-    differ = parameters.ranges or parameters.setpoint == "random"
-    bounds = [
-        _least(parameters, kind, drawn.numbers[i], drawn.setpoints[i]) / samples
-        for i in range(episodes if differ else 1)
-    ]
-    # Rounded to be the same on every machine, as solvers differ in later digits.
-    values = tuple(round(bound, 6) for bound in bounds)
+    """Return the bound of one of `KINDS`; the arguments are those of `least_possible`."""
+    if not is_random(parameters):
+        episodes = 1
+    drawn = _draw(parameters, samples, episodes, seed)
+    if not (parameters.ranges or parameters.setpoint == "random"):
+        episodes = 1  # Noise and load do not change the bound.
+    values = []
+    for i in range(episodes):
+        error_sum = _error_sum(parameters, kind, drawn.numbers[i], drawn.setpoints[i])
+        # Rounded to be the same on all machines, as solvers differ in later digits.
+        values.append(round(error_sum / samples, 6))
     idle = student(drawn.idle_errors)
-    return LeastPossible(**vars(student(values)), kind=kind, idle=idle, episodes=values)
+    return LeastPossible(**vars(student(values)), kind=kind, idle=idle, episodes=tuple(values))
 
 
-def _least(
+def _error_sum(
     parameters: Parameters,
     kind: str,
     numbers: PlantNumbers[float],
     setpoint: Array,
     unknown_of: Callable[[LinearModel], Unknown] = unknown,
 ) -> float:
-    """Return the bound on the sum of |e(k)| over k = 1 to N of an episode, degC.
+    """Return the term of one episode in a bound on the sum of |e(k)| over k = 1 to N, degC.
 
-    For the kind "causal" it includes the penalty of the flows. A reference includes the small
-    price of the valve's travel, as solvers agree on the sum alone.
+    The term is the sum of the bounds of E|e(k)|. For the kind "causal" the term also includes
+    the penalty of the flows, and for the kind "reference" the small price of valve travel, as
+    solvers agree on this sum alone.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment.
+    kind
+        One of `KINDS`.
+    numbers
+        The plant numbers of the episode.
+    setpoint
+        y_d(k) for k = 0 to N, degC, shape (N + 1,).
+    unknown_of
+        Returns what no controller knows of a plant: the bounds of E|m - n|.
     """
-    # A reference looks beyond the end.
-    ahead = int(numbers.delay) + len(parameters.b) + TAIL if kind == "reference" else 0
-    model = LinearModel(parameters, numbers, np.arange(len(setpoint) + ahead))
+    k = np.arange(len(setpoint))
+    if kind == "reference":  # which looks beyond the end of the episode
+        k = np.arange(len(setpoint) + int(numbers.delay) + len(parameters.b) + TAIL)
+    model = LinearModel(parameters, numbers, k)
     unforeseen = unknown_of(model)
     if kind == "reference":
-        error, flow = reference(model, unforeseen, setpoint)
-        price = SMOOTH * np.abs(np.diff(flow, prepend=0.0))
+        errors, flow = reference(model, unforeseen, setpoint)
+        costs = TRAVEL_PRICE * np.abs(np.diff(flow, prepend=0.0))
     else:
         penalty = np.zeros(len(setpoint))
         if kind == "causal" and parameters.setpoint_amplitude > 0.0:
-            from benchmarks.bounds.causal import SetPointLaw  # here: few cases need it
-
             penalty = SetPointLaw(model, unforeseen).penalty(setpoint)
-        error, flow = plan(model, unforeseen, setpoint, penalty=penalty)
-        price = penalty * flow
-    return float(error[1:].sum() + price.sum())  # no flow changes e(0)
+        errors, flow = plan(model, unforeseen, setpoint, penalty=penalty)
+        costs = penalty * flow
+    return float(errors[1:].sum() + costs.sum())  # no flow changes e(0)

@@ -7,14 +7,14 @@ walk and of its jumps do to y(k). With n(k) the sum of their effects,
     e(k) = m(k) - n(k),    m(k): the error if they had no effect, known at k - d - 1.
 
 The linear program needs a lower bound of E|m - n| that is a convex, piecewise linear function
-of E[m]. As n has the mean 0, E[m] is the mean error. For every slope s, and whatever is known
+of E[m]. As n has the mean 0, E[m] is the mean of e. For every slope s, and whatever is known
 at k - d - 1,
 
     E[|m - n| given what is known] >= s m + min over x of E[|x - n| - s x given what is known].
 
 The mean over everything that can be known is a line: E|m - n| >= s E[m] + a(s), where a(s) is
 the mean of the minima. As the slope is the same in each of them, it does not matter what m
-depends on. Four steps lead to a number below a(s) that can be computed:
+depends on. Three steps lead to a number below a(s) that can be computed:
 
 1. More is assumed to be known than any controller knows: the load up to k - d - 1, its walk
    and its steps apart. *When* the load jumps later is not known, so the same x stands for all
@@ -22,15 +22,16 @@ depends on. Four steps lead to a number below a(s) that can be computed:
    given the load, output and readings are jointly normal, and n has the variance of the best
    prediction from the readings (Kalman), whatever they are.
 2. What is then known of n is a single number, the level l that the steps of the load have at
-   k - d - 1: the first jump takes it away, and puts a new level in its place. So n is l times
-   something plus something that does not depend on l, and |x - n| - s x is convex in x and l
-   together. Its minimum over x is a convex function of l. Thus the mean over a slice of levels
-   is at least the value at the mean of the slice (Jensen).
-3. The normal and uniform distributions that remain are replaced by atoms, the means of their
-   slices, and sums of them by fewer atoms, the means of neighbours. The mean of |x - n| becomes
-   smaller by this (Jensen).
+   k - d - 1: the first jump takes the level away, and puts a new level in its place. So n is
+   the product of l and a random factor, plus a random number that does not depend on l, and
+   |x - n| - s x is convex in x and l together. The minimum over x is a convex function of l.
+   Thus the mean of the minimum over a slice of levels is at least the minimum at the mean
+   level of the slice (Jensen).
+3. Each normal or uniform distribution is replaced by atoms, the means of equally probable
+   slices. A sum of distributions is reduced to fewer atoms, the means of neighbouring atoms.
+   Both make the mean of |x - n| smaller (Jensen).
 
-Then n has finitely many values, and the minimum over x is at one of them, a quantile.
+Then n has finitely many values, and the minimum over x is at one of these values, a quantile.
 
 The bound does not count that no controller sees the load itself: see `hidden.py`.
 """
@@ -48,13 +49,14 @@ from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
-# With these numbers the bounds of the presets are within 0.0002 degC of what finer ones give.
-ATOMS = 128  # that represent noise and walk together
-WALK_SLICES = 4  # of each step of the walk
-JUMP_ATOMS = 32  # that represent the effect of a jump and of those after it, with the noise
-JUMP_SLICES = 8  # of the new level after a jump
+# With these numbers the bounds of the presets are within 0.0002 degC of the bounds that finer
+# atoms and slices give.
+NOISE_ATOMS = 128  # atoms of the sum of noise and walk
+WALK_SLICES = 4  # atoms of each step of the walk
+JUMP_ATOMS = 32  # atoms of the effect of a jump and of the jumps after it, with the noise
+JUMP_SLICES = 8  # atoms of the new level after a jump
 LEVELS = 8  # slices of the level known at k - d - 1, an even number
-NEGLIGIBLE = 1e-8  # degC^2: variance of exact readings, which keeps rounding harmless
+SMALLEST_VARIANCE = 1e-8  # degC^2: variance of exact readings, so that rounding does no harm
 # The slopes of the lines, which touch E|m - n| at quantiles of n. They are closer together
 # towards 1, where E|m - n| bends most slowly towards |m|.
 SLOPES = 1.0 - np.array([64, 53, 42, 31, 22, 14, 8, 4, 1, 0]) / 64.0
@@ -63,25 +65,27 @@ SLOPES = 1.0 - np.array([64, 53, 42, 31, 22, 14, 8, 4, 1, 0]) / 64.0
 class Distribution(NamedTuple):
     """A distribution of finitely many values for each sample of an episode."""
 
-    values: Array
-    """degC, shape (samples, atoms)."""
-    weights: Array
-    """Their probabilities, shape (samples, atoms)."""
+    values: Array  # degC, shape (samples, atoms)
+    weights: Array  # probabilities of the values, shape (samples, atoms)
 
 
 def unknown(model: LinearModel) -> Unknown:
-    """Return the bounds from what remains unknown at each sample of an episode."""
+    """Return the bounds from what remains unknown at each sample of an episode.
+
+    The samples are those of the model, from k = 0 on.
+    """
     numbers = model.numbers
-    walk = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
+    largest_step = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
     amplitude = numbers.disturbance_amplitude
-    if not (walk or amplitude):
+    if not (largest_step or amplitude):
         return unknown_of_normal(noise_variance(model))
 
     changes = load_changes(model)
     noise = _normal(noise_variance(model))
-    if walk:
+    if largest_step:
         for effect in changes.effects.T:
-            noise = _sum(noise, _uniform(walk * effect, WALK_SLICES), ATOMS)
+            step = _uniform(largest_step * effect, WALK_SLICES)
+            noise = _sum(noise, step, NOISE_ATOMS)
     if not amplitude:
         return Unknown(SLOPES, _intercepts(noise, SLOPES))
     jump = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval)
@@ -96,32 +100,42 @@ def unknown_of_normal(variance: Array) -> Unknown:
 
 
 def noise_variance(model: LinearModel) -> Array:
-    """Return the variance of the noise in y(k) that is unknown at k - d - 1, degC^2, for all k.
+    """Return the variance of the noise in y(k) that is unknown at k - d - 1, degC^2.
 
-    With a noisy transmitter it is that of the best prediction.
+    The shape is (samples,). With a noisy transmitter it is the variance of the best prediction
+    of y(k) from the readings, without a load.
     """
-    samples, numbers = len(model.load), model.numbers
-    if numbers.noise_variance == 0.0:
-        return np.zeros(samples)
+    if model.numbers.noise_variance == 0.0:
+        return np.zeros(len(model.load))
+    F, Q = noise_system(model)
+    filtered = np.zeros_like(F)  # with a perfect transmitter nothing is uncertain
+    if model.numbers.measurement_noise_variance > 0.0:
+        filtered = filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
+    return predicted_variance(filtered, F, Q, model.lag)
+
+
+def noise_system(model: LinearModel) -> tuple[Array, Array]:
+    """Return F(k) and Q(k) of the state of (28), each of shape (samples, size, size).
+
+    x(k) = F(k) x(k-1) + a noise with the covariance Q(k), which is the effect of xi(k).
+    """
     F, enters = model.state_space()
-    Q = np.broadcast_to(numbers.noise_variance * np.outer(enters, enters), F.shape)
-    known = np.zeros_like(F)  # with a perfect transmitter nothing is uncertain
-    if numbers.measurement_noise_variance > 0.0:
-        known = filtered_covariance(F, Q, numbers.measurement_noise_variance)
-    return predicted_variance(known, F, Q, model.lag)
+    covariance = model.numbers.noise_variance * np.outer(enters, enters)
+    return F, np.broadcast_to(covariance, F.shape)
 
 
 def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
     """Return the covariances of the state x(k), given the readings of x_0 up to k (Kalman).
 
-    x(k) = F(k) x(k-1) + a noise with the covariance Q(k), from x(0) = 0. All arrays have the
-    shape (samples, size, size).
+    x(k) = F(k) x(k-1) + a noise with the covariance Q(k), from x(0) = 0. A reading has the
+    variance `reading_variance`, degC^2. All arrays have the shape (samples, size, size).
     """
     filtered = np.zeros_like(F)
     P = filtered[0]
     for k in range(1, len(F)):
         P = F[k] @ P @ F[k].T + Q[k]
-        P = P - np.outer(P[:, 0], P[0]) / (P[0, 0] + max(reading_variance, NEGLIGIBLE))
+        innovation_variance = P[0, 0] + max(reading_variance, SMALLEST_VARIANCE)
+        P = P - np.outer(P[:, 0], P[0]) / innovation_variance
         filtered[k] = P
     return filtered
 
@@ -129,35 +143,36 @@ def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
 def predicted_variance(filtered: Array, F: Array, Q: Array, lag: int) -> Array:
     """Return the variance of x_0(k) given the readings up to k - lag, shape (samples,).
 
-    The arguments are those of `filtered_covariance`, and what it returns.
+    `filtered` is what `filtered_covariance` returns for F and Q.
     """
     samples = len(F)
     steps = min(lag, samples)
     k = np.arange(samples) - steps
     P = filtered[np.maximum(k, 0)]
-    for _ in range(steps):  # for all k at once
+    for _ in range(steps):  # for all k together
         k = k + 1
-        i = np.maximum(k, 0)
-        advanced = F[i] @ P @ F[i].transpose(0, 2, 1) + Q[i]
+        from_start = np.maximum(k, 0)
+        advanced = F[from_start] @ P @ F[from_start].transpose(0, 2, 1) + Q[from_start]
         P = np.where((k >= 1)[:, np.newaxis, np.newaxis], advanced, P)
     # Rounding can leave a variance of 0 a little below it.
     return np.maximum(P[:, 0, 0], 0.0)
 
 
 class LoadChanges(NamedTuple):
-    """The changes of the load within d + 1 samples before each k, unknown at k - d - 1."""
+    """The changes of the load within d + 1 samples before k, for each k: unknown at k - d - 1.
 
+    The load can change at k = `LOAD_INTERVAL`, 2 `LOAD_INTERVAL` and so on.
+    """
+
+    # What each change adds to y(k), degC for each degC of the load, the latest change first;
+    # 0 where there are fewer changes. Shape (samples, largest number of changes).
     effects: Array
-    """What each of them adds to y(k) per unit of the load, the latest change first, 0 where
-    there are fewer. Shape (samples, most changes)."""
-    counts: NDArray[np.intp]
-    """How many there are, shape (samples,)."""
-    before: NDArray[np.intp]
-    """How many changes have been up to k - d - 1, shape (samples,)."""
+    counts: NDArray[np.intp]  # the number of these changes, shape (samples,)
+    earlier: NDArray[np.intp]  # the number of changes up to k - d - 1, shape (samples,)
 
 
 def load_changes(model: LinearModel) -> LoadChanges:
-    """Return the changes of the load that are unknown at each sample."""
+    """Return the changes of the load that are unknown at each sample of an episode."""
     samples = len(model.load)
     A, _ = equations(model, samples)
     k = np.arange(samples)
@@ -168,22 +183,22 @@ def load_changes(model: LinearModel) -> LoadChanges:
     responses = scipy.sparse.linalg.spsolve_triangular(A, steps)
     responses[age >= model.lag] = 0.0
     latest = k // LOAD_INTERVAL
-    before = np.maximum(k - model.lag, 0) // LOAD_INTERVAL
-    most = -(-min(model.lag, samples) // LOAD_INTERVAL)
+    earlier = np.maximum(k - model.lag, 0) // LOAD_INTERVAL
+    largest_count = -(-min(model.lag, samples) // LOAD_INTERVAL)  # rounded up
     effects = np.stack(
-        [responses[k, np.maximum(latest - place, 0)] for place in range(most)], axis=1
+        [responses[k, np.maximum(latest - place, 0)] for place in range(largest_count)], axis=1
     )
-    return LoadChanges(effects, latest - before, before)
+    return LoadChanges(effects, latest - earlier, earlier)
 
 
 def _normal(variance: Array) -> Distribution:
     """Return equally probable atoms of normal distributions with these variances, degC^2."""
-    # Means of equally probable slices of the standard normal distribution.
-    # Without scipy.stats, which takes long to import.
-    ends = scipy.special.ndtri(np.linspace(0.0, 1.0, ATOMS + 1))
+    # The atoms are means of slices of the standard normal distribution. They do without
+    # scipy.stats, which takes long to import.
+    ends = scipy.special.ndtri(np.linspace(0.0, 1.0, NOISE_ATOMS + 1))
     densities = np.exp(-(ends**2) / 2.0) / np.sqrt(2.0 * np.pi)
-    values = np.sqrt(variance)[:, np.newaxis] * (-np.diff(densities) * ATOMS)
-    return Distribution(values, np.full(values.shape, 1.0 / ATOMS))
+    values = np.sqrt(variance)[:, np.newaxis] * (-np.diff(densities) * NOISE_ATOMS)
+    return Distribution(values, np.full(values.shape, 1.0 / NOISE_ATOMS))
 
 
 def _uniform(half_width: Array, slices: int) -> Distribution:
@@ -198,12 +213,12 @@ def _sum(first: Distribution, second: Distribution, atoms: int) -> Distribution:
     samples = len(first.values)
     values = first.values[:, :, np.newaxis] + second.values[:, np.newaxis]
     weights = first.weights[:, :, np.newaxis] * second.weights[:, np.newaxis]
-    together = Distribution(values.reshape(samples, -1), weights.reshape(samples, -1))
-    return _reduced(together, atoms)
+    exact = Distribution(values.reshape(samples, -1), weights.reshape(samples, -1))
+    return _reduced(exact, atoms)
 
 
 def _mixture(parts: Sequence[Distribution], probabilities: Sequence[Array]) -> Distribution:
-    """Return the distribution that is each of the parts with its probability, (samples,)."""
+    """Return the mixture of distributions, each with its probabilities, shape (samples,)."""
     weights = [
         probability[:, np.newaxis] * part.weights
         for part, probability in zip(parts, probabilities, strict=True)
@@ -212,8 +227,8 @@ def _mixture(parts: Sequence[Distribution], probabilities: Sequence[Array]) -> D
 
 
 def _sorted(distribution: Distribution) -> Distribution:
-    """Return a distribution with its values in ascending order."""
-    # Stable, as that is fast where the values are a few ascending rows one after another.
+    """Return a distribution with the values of each sample in ascending order."""
+    # A stable sort is fast where the values are a few ascending rows one after another.
     order = np.argsort(distribution.values, axis=1, kind="stable")
     return Distribution(*(np.take_along_axis(array, order, 1) for array in distribution))
 
@@ -228,23 +243,37 @@ def _reduced(distribution: Distribution, atoms: int) -> Distribution:
 
 
 def _after_jumps(effects: Array, amplitude: float, jump: float) -> list[Distribution]:
-    """Return what a jump at each change adds to n(k), with all that happens after it.
+    """Return what a jump at each change adds to n(k), with the effects of later jumps.
 
-    The new level adds its effect until the next jump, which takes the level away and adds what
-    follows it. None of this depends on the level before. The order is that of `effects`.
+    The new level adds its effect until the next jump, which takes the level away and adds the
+    effect of the next level. The level before the jump does not matter.
+
+    Parameters
+    ----------
+    effects
+        Of `LoadChanges`, degC for each degC, shape (samples, changes), the latest change first.
+    amplitude
+        New levels are uniform within +-`amplitude`, degC.
+    jump
+        The probability that the load jumps at a change.
+
+    Returns
+    -------
+    list of Distribution
+        A distribution for each change, in the order of `effects`.
     """
-    samples, most = effects.shape
+    samples, changes = effects.shape
     distributions: list[Distribution] = []
-    for place in range(most):  # the latest change first
+    for place in range(changes):
         effect = effects[:, place]
-        last = _uniform(amplitude * effect, JUMP_ATOMS)  # if no later change is a jump
-        parts, probabilities = [last], [np.full(samples, (1.0 - jump) ** place)]
-        for following in range(place):
-            until = effect - effects[:, following]
-            level = _uniform(amplitude * until, JUMP_SLICES)
-            parts.append(_sum(level, distributions[following], JUMP_ATOMS))
-            no_earlier = (1.0 - jump) ** (place - 1 - following)
-            probabilities.append(np.full(samples, no_earlier * jump))
+        parts = [_uniform(amplitude * effect, JUMP_ATOMS)]  # if no later change is a jump
+        probabilities = [np.full(samples, (1.0 - jump) ** place)]
+        for next_jump in range(place):
+            effect_until_then = effect - effects[:, next_jump]
+            level = _uniform(amplitude * effect_until_then, JUMP_SLICES)
+            parts.append(_sum(level, distributions[next_jump], JUMP_ATOMS))
+            none_between = (1.0 - jump) ** (place - 1 - next_jump)
+            probabilities.append(np.full(samples, none_between * jump))
         distributions.append(_reduced(_mixture(parts, probabilities), JUMP_ATOMS))
     return distributions
 
@@ -252,50 +281,56 @@ def _after_jumps(effects: Array, amplitude: float, jump: float) -> list[Distribu
 def _intercepts_with_jumps(
     changes: LoadChanges, noise: Distribution, amplitude: float, jump: float
 ) -> Array:
-    """Return the mean of the intercepts over the level at k - d - 1, degC.
+    """Return the intercepts if the load jumps, degC, shape (samples, slopes).
 
-    `noise` is that of xi and the walk; `jump` is the probability of a jump at a change. The
-    level is 0 until the first jump of the episode, and uniform within +-`amplitude` afterwards.
+    They are means over the level at k - d - 1, which is 0 until the first jump of the episode,
+    and uniform within +-`amplitude`, degC, afterwards. `noise` is the distribution of the
+    effects of xi and of the walk; `jump` is the probability that the load jumps at a change.
     """
     samples = len(changes.counts)
     # The load does not jump within the d + 1 samples, or one of the changes is the first jump.
     parts = [noise]
     probabilities = [((1.0 - jump) ** changes.counts).astype(np.float64)]
-    level_effects = [np.zeros(samples)]  # of the level at k - d - 1 on n(k), degC per degC
-    fewer = _reduced(noise, JUMP_ATOMS)
-    for place, after in enumerate(_after_jumps(changes.effects, amplitude, jump)):
-        parts.append(_sum(fewer, after, JUMP_ATOMS))
-        earlier = changes.counts - 1 - place
-        first = jump * (1.0 - jump) ** np.maximum(earlier, 0)
-        probabilities.append(np.where(earlier >= 0, first, 0.0))
+    # What the level at k - d - 1 adds to n(k) in each part, degC for each degC.
+    level_effects = [np.zeros(samples)]
+    coarse_noise = _reduced(noise, JUMP_ATOMS)
+    for place, after_jump in enumerate(_after_jumps(changes.effects, amplitude, jump)):
+        parts.append(_sum(coarse_noise, after_jump, JUMP_ATOMS))
+        changes_before = changes.counts - 1 - place
+        first_jump = jump * (1.0 - jump) ** np.maximum(changes_before, 0)
+        probabilities.append(np.where(changes_before >= 0, first_jump, 0.0))
         level_effects.append(-changes.effects[:, place])
     at_level_0 = _mixture(parts, probabilities)
-    of_level = np.hstack(
+    effect_of_level = np.hstack(
         [
             np.broadcast_to(effect[:, np.newaxis], part.values.shape)
             for effect, part in zip(level_effects, parts, strict=True)
         ]
     )
 
-    # By symmetry, the intercept of -l at the slope s is that of l at -s.
+    # By symmetry, the intercept at the level -l and the slope s is that at l and -s. So only
+    # the upper half of the slices is computed, with slopes of both signs.
     both_signs = np.append(SLOPES, -SLOPES)
     half = LEVELS // 2
     levels = amplitude * (np.arange(half) + 0.5) / half
-    never_jumped = (1.0 - jump) ** changes.before
+    never_jumped = (1.0 - jump) ** changes.earlier
     intercepts = np.zeros((samples, len(SLOPES)))
-    for level in (0.0, *levels):
-        at_level = at_level_0._replace(values=at_level_0.values + level * of_level)
-        of_signs = _intercepts(at_level, both_signs).reshape(samples, 2, -1)
-        probability = never_jumped if level == 0.0 else (1.0 - never_jumped) / half
-        intercepts += probability[:, np.newaxis] * of_signs.mean(axis=1)
+    probabilities_of_levels = [never_jumped] + [(1.0 - never_jumped) / half] * half
+    for level, probability in zip((0.0, *levels), probabilities_of_levels, strict=True):
+        at_level = at_level_0._replace(values=at_level_0.values + level * effect_of_level)
+        by_sign = _intercepts(at_level, both_signs).reshape(samples, 2, -1)
+        intercepts += probability[:, np.newaxis] * by_sign.mean(axis=1)
     return intercepts
 
 
 def _intercepts(distribution: Distribution, slopes: Array) -> Array:
-    """Return min over x of E|x - n| - s x for each slope s, degC, shape (samples, slopes)."""
+    """Return min over x of E|x - n| - s x for each slope s, degC, shape (samples, slopes).
+
+    `distribution` is that of n.
+    """
     values, weights = _sorted(distribution)
-    probability = weights.cumsum(axis=1)  # of n not above a value
-    partial_mean = (weights * values).cumsum(axis=1)  # what these add to the mean of n
+    probability = weights.cumsum(axis=1)  # that n is not above a value
+    partial_mean = (weights * values).cumsum(axis=1)  # what these values add to the mean of n
     mean = partial_mean[:, -1]
     k = np.arange(len(values))
     intercepts = np.empty((len(values), len(slopes)))
@@ -305,6 +340,6 @@ def _intercepts(distribution: Distribution, slopes: Array) -> Array:
         below = probability < (1.0 + slope) / 2.0 - 1e-12
         quantile = np.minimum(below.sum(axis=1), values.shape[1] - 1)
         x = values[k, quantile]
-        above = 1.0 + slope - 2.0 * probability[k, quantile]
-        intercepts[:, i] = mean - 2.0 * partial_mean[k, quantile] - above * x
+        excess = 1.0 + slope - 2.0 * probability[k, quantile]
+        intercepts[:, i] = mean - 2.0 * partial_mean[k, quantile] - excess * x
     return intercepts

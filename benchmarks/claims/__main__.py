@@ -30,26 +30,27 @@ class Options:
 def work(options: Options) -> str:
     """Examine the claims and write the verdicts, also where some examinations have failed."""
     from benchmarks.claims.claims import CLAIMS, examined
-    from benchmarks.claims.runs import Batch, sections, table
+    from benchmarks.claims.findings import sections, table
+    from benchmarks.claims.runs import Batch
     from benchmarks.lib.report import write_report
 
-    chosen = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
-    made = origin()
+    names = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
+    provenance = origin()
     # The last claims take longest, and start first.
-    tasks = {name: partial(examined, name, Batch(options.runs)) for name in reversed(chosen)}
+    tasks = {name: partial(examined, name, Batch(options.runs)) for name in reversed(names)}
     findings: dict[str, Any] = {}
     with results_folder(options.out) as folder:
         try:
             findings.update(options.fan_out.stream(tasks, "claims"))
         finally:
             if missing := len(tasks) - len(findings):
-                made["missing"] = f"{missing} of {len(tasks)} claims are missing"
+                provenance["missing"] = f"{missing} of {len(tasks)} claims are missing"
             if findings:
-                in_order = {name: findings[name] for name in chosen if name in findings}
+                in_order = {name: findings[name] for name in names if name in findings}
                 numbers = table(CLAIMS, in_order)
+                report = sections(CLAIMS, numbers)
                 write_csv(folder / "claims.csv", numbers)
-                parts = sections(CLAIMS, numbers)
-                write_report(folder, "The paper's claims", parts, made, printed=1)
+                write_report(folder, "The paper's claims", report, provenance, printed=1)
     return f"All numbers are in {options.out}/report.md and claims.csv"
 
 

@@ -3,14 +3,18 @@
 `python benchmarks/examples/sb3.py` trains a policy, saves it in `ppo-0.zip`, and prints its
 scores: 0 is a valve left alone, 1 the least possible error.
 
-Copy this one file; `benchmarks/train/ppo.py` is built on it. It works for these reasons:
+Copy this one file; `benchmarks/train/ppo.py` is built on it. The training works for these
+reasons:
 
-- **Groups.** Eight plants meet the same noise and set points, and differ only in what they
-  explore. Less the mean of the group, the advantages have much less variance.
-- **Changes.** The policy sees the error and changes, but no levels, and has no biases. It is at
-  rest only where the error is 0, so it has no offset, and what holds at +5 degC holds at -5.
-- **Exploration that falls.** If it is learnt, it stays high.
-- The action changes the flow (`IncrementalAction`), which also compensates the dead zone.
+- **Groups.** Eight plants meet the same noise and set points, and differ only in the actions
+  that they explore. Without the mean of the group, advantages have much less variance.
+- **Changes.** The policy sees the error and changes, but no levels, and has no biases. The
+  policy is at rest only where the error is 0, so it has no offset, and acts at -5 degC as at
+  +5 degC.
+- **Exploration that falls.** The standard deviation of the actions follows a schedule, as it
+  stays high if it is learnt.
+- **Changes of the flow.** The action changes the flow (`IncrementalAction`, which also
+  compensates the dead zone).
 """
 
 import argparse
@@ -29,13 +33,15 @@ from torch import Tensor, nn
 from mptc_gym import evaluate
 from mptc_gym.sb3 import make_vec_env, save, spec_of
 
-GROUP = 8  # plants that meet the same
+GROUP = 8  # plants that meet the same noise and set points
 SETTINGS: dict[str, Any] = {
     "n_steps": 64,  # samples per plant between updates
     "batch_size": 4096,
     "n_epochs": 5,
     "gamma": 0.96,  # per sample
-    "gae_lambda": 1.0,  # below 1, the value function also stands in for effects in transit
+    # Below 1, the value function would also stand in for effects of actions that the delay
+    # still holds back.
+    "gae_lambda": 1.0,
 }
 WINDOWS = {"setpoint_window": 3, "error_window": 1, "output_window": 64, "action_window": 64}
 PLANTS: dict[str, Any] = {
@@ -50,31 +56,41 @@ PLANTS: dict[str, Any] = {
 
 
 def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
-    """Return the error and the changes of set point, temperature and flow, of order 1."""
+    """Return the error and the changes of set point, temperature and flow, of order 1.
+
+    `observations` have the shape (n, size), with the `windows` of setpoints, errors, outputs
+    and actions in this order, by length. There are n rows of inputs.
+    """
     setpoints, errors, outputs, actions = observations.split([*windows.values()], dim=1)
-    seen = 0.2 * changes(setpoints, 3), 0.5 * changes(outputs, 8), changes(actions, 30)
-    return torch.cat([errors, *seen], dim=1)
+    scaled_changes = [
+        0.2 * changes(setpoints, 3),
+        0.5 * changes(outputs, 8),
+        changes(actions, 30),
+    ]
+    return torch.cat([errors, *scaled_changes], dim=1)
 
 
 def changes(window: Tensor, single: int) -> Tensor:
     """Return the differences between means over stretches of a window, newest first.
 
-    The first have a `single` sample; those that follow have 2, 4, 8 and so on.
+    The window has the shape (n, length). The newest stretches have one sample each, and there
+    are `single` of them; the older stretches have 2, 4, 8 and so on.
     """
     lengths = [1] * single
-    while left := window.shape[1] - sum(lengths):
-        lengths.append(min(2 * lengths[-1], left))
-    return -torch.stack([each.mean(1) for each in window.split(lengths, 1)], 1).diff()
+    while remaining := window.shape[1] - sum(lengths):
+        lengths.append(min(2 * lengths[-1], remaining))
+    means = [stretch.mean(1) for stretch in window.split(lengths, 1)]
+    return -torch.stack(means, 1).diff()
 
 
 class Changes(BaseFeaturesExtractor):
-    """Extract the inputs of the networks."""
+    """Extract the inputs of the networks: see `inputs`."""
 
     def __init__(self, space: Any) -> None:
         super().__init__(space, features_dim=49)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Return the inputs, one row per observation."""
+        """Return the inputs, one row per observation, shape (n, 49)."""
         return inputs(observations, WINDOWS)
 
 
@@ -89,28 +105,36 @@ class GroupBuffer(RolloutBuffer):
 
 
 class Exploration(BaseCallback):
-    """Lead the logarithm of the actions' standard deviation from one value to another."""
+    """Move the logarithm of the actions' standard deviation from `first` to `last`.
+
+    It changes in proportion to the samples of experience.
+    """
 
     def __init__(self, first: float, last: float) -> None:
         super().__init__()
-        self._first, self._last = first, last
+        self._first = first
+        self._last = last
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
-        done = self.num_timesteps / self.locals["total_timesteps"]
+        progress = self.num_timesteps / self.locals["total_timesteps"]
         log_std = cast("nn.Parameter", self.model.policy.log_std)
-        log_std.data.fill_(self._first + done * (self._last - self._first))
+        log_std.data.fill_(self._first + progress * (self._last - self._first))
 
 
 def make_ppo(plants: VecEnv, seed: int, **policy: Any) -> PPO:
-    """Return an untrained model, with arguments of its policy, which has no biases."""
+    """Return an untrained model for these plants, whose policy has no biases.
+
+    `policy` holds arguments of the policy's class.
+    """
     model = PPO(
         "MlpPolicy",
         plants,
-        # At the last update nothing remains; the lower bound lets it have an effect.
-        learning_rate=lambda left: 2e-3 * max(left, 0.05),
+        # The learning rate falls with the share of the training that remains. At the last
+        # update nothing remains; the lower bound lets this update have an effect.
+        learning_rate=lambda remaining: 2e-3 * max(remaining, 0.05),
         rollout_buffer_class=GroupBuffer,
         policy_kwargs=policy,
         seed=seed,

@@ -1,8 +1,9 @@
 """Train your own network through the plant: `python -m benchmarks.examples.through_plant`.
 
 The PyTorch environment is differentiable, so the error of a whole run has a gradient with
-respect to the policy's weights: no value function, no exploration. Training takes half a minute
-on one core. The policy is then tested on the paper's square wave, which it was not trained on.
+respect to the policy's weights. Training needs no value function and no exploration, and takes
+half a minute on one core. The policy is then tested on the paper's square wave, on which it was
+not trained.
 """
 
 import sys
@@ -21,29 +22,38 @@ WINDOWS: Any = {
     "action_window": 24,
 }
 SETPOINTS: Any = {"setpoint": "random", "setpoint_amplitude": 6.0, "setpoint_period": 400}
-HOLDS = -0.1465  # steady-state action per degC: the plant's gain is -0.6825 degC per t/h
+# Action that holds a temperature, per degC: the plant's gain is -0.6825 degC per t/h, and an
+# action of 1 is a flow of 10 t/h.
+HOLDS = -0.1465
 
 
-def act(network: nn.Module, seen: Tensor) -> Tensor:
-    """Return actions, shape (n, 1). In steady state at the set point all inputs are 0."""
-    setpoint, outputs, actions = seen[:, :1], seen[:, 1:25], seen[:, 25:]
-    steady = torch.cat([0.5 * (setpoint - outputs), actions - HOLDS * setpoint], dim=1)
-    action: Tensor = HOLDS * setpoint + network(steady)
+def act(network: nn.Module, observations: Tensor) -> Tensor:
+    """Return actions, shape (n, 1), for observations, shape (n, 49).
+
+    The inputs of the network are all 0 in steady state at the set point.
+    """
+    setpoint, outputs, actions = observations.split([1, 24, 24], dim=1)
+    inputs = torch.cat([0.5 * (setpoint - outputs), actions - HOLDS * setpoint], dim=1)
+    action: Tensor = HOLDS * setpoint + network(inputs)
     return action
 
 
 def run(network: nn.Module, plants: MiddlePointTorchEnv, samples: int, seed: int) -> Tensor:
-    """Return the errors of a run, degC, shape (samples, n)."""
-    seen, _ = plants.reset(seed=seed)
+    """Return the errors of n plants in a run, degC, shape (samples, n)."""
+    observations, _ = plants.reset(seed=seed)
     errors = []
     for _ in range(samples):
-        seen, _, _, _, infos = plants.step(act(network, seen))
+        observations, _, _, _, infos = plants.step(act(network, observations))
         errors.append(infos["error"])
     return torch.stack(errors)
 
 
 def main(steps: int = 100, plants: int = 64, samples: int = 300) -> Evaluation:
-    """Train a policy, and evaluate it on the square wave."""
+    """Train a policy, and return its evaluation on the square wave.
+
+    The policy is trained in `steps` updates, each from a run of `samples` samples of `plants`
+    plants.
+    """
     torch.manual_seed(0)
     layers = nn.Linear(48, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)
     network = nn.Sequential(*layers)
@@ -58,7 +68,9 @@ def main(steps: int = 100, plants: int = 64, samples: int = 300) -> Evaluation:
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
     network.requires_grad_(False)
-    return evaluate(lambda seen: act(network, torch.as_tensor(seen)).numpy(), **WINDOWS)
+    return evaluate(
+        lambda observations: act(network, torch.as_tensor(observations)).numpy(), **WINDOWS
+    )
 
 
 if __name__ == "__main__":

@@ -2,9 +2,8 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium
@@ -38,7 +37,8 @@ class Agent(Protocol):
 class IdleValve:
     """No control: the valve stays at 0 t/h.
 
-    The limits are those of the actuator, t/h, for all runs or of shape (runs,).
+    `u_min` and `u_max` are the limits of the actuator, t/h, of shape (runs,) or the same for
+    all runs.
     """
 
     def __init__(self, u_min: Any = -10.0, u_max: Any = 10.0) -> None:
@@ -48,7 +48,7 @@ class IdleValve:
         """Remember nothing."""
 
     def act(self, observation: NDArray[np.float32]) -> Array:
-        """Return the actions that keep the flow, shape (runs, 1)."""
+        """Return the actions that keep the flow at 0 t/h, shape (runs, 1)."""
         return np.broadcast_to(self.action, (len(observation), 1))
 
 
@@ -64,19 +64,22 @@ class Trajectory:
     next_setpoint: Array  # y_d(k + 1), degC
 
     def __getitem__(self, samples: slice) -> "Trajectory":
-        """Return the signals of some samples."""
+        """Return the trajectory of a slice of the samples."""
         return Trajectory(*(signal[samples] for signal in vars(self).values()))
 
 
 def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
-    """Make a batch of plants with episodes of `samples` samples."""
+    """Return a vector environment of `num_envs` plants with episodes of `samples` samples."""
     return gymnasium.make_vec(
         "MiddlePoint-v0", num_envs=num_envs, max_episode_steps=samples, **arguments
     )
 
 
 def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[Array]:
-    """Return the plant numbers that the environment draws for each run, shape (runs,)."""
+    """Return the plant numbers of run i = 0 to runs - 1, as drawn with the seed `seed + i`.
+
+    Each number is an array of shape (runs,), also if it is the same for all runs.
+    """
     numbers = Ranges(parameters).lowest.chosen(PLANT_NUMBERS)
     if parameters.ranges:
         _, info = make_plants(runs, 1, **asdict(parameters)).reset(seed=seed)
@@ -122,13 +125,22 @@ def rollout(
     before
         Called with k before the controller acts at sample k, to observe or to damage it.
     """
-    seeds = [*range(seed, seed + plants.num_envs)]
+    clock = itertools.count()
+
+    def act(observations: Any) -> Any:
+        if before:
+            before(next(clock))
+        return agent.act(observations)
+
     agent.reset()
-    act = partial(_watched, before, itertools.count(), agent.act) if before else agent.act
-    signals, steps = [], run_batch(plants, act, samples, seeds)
-    for (_, info, _), (_, next_info, _) in itertools.pairwise(steps):
+    seeds = [*range(seed, seed + plants.num_envs)]
+    signals = []
+    steps = run_batch(plants, act, samples, seeds)
+    for sample, next_sample in itertools.pairwise(steps):
+        info = sample.infos
+        next_info = next_sample.infos
         # A step reports the command and the applied flow of the sample at which it starts.
-        sample = [
+        signals_of_sample = [
             info["setpoint"],
             info["output"],
             next_info["command"],
@@ -136,25 +148,19 @@ def rollout(
             next_info["error"],
             next_info["setpoint"],
         ]
-        signals.append(np.array(sample))
+        signals.append(np.array(signals_of_sample))
     return Trajectory(*np.stack(signals, axis=1))
-
-
-def _watched(
-    before: Callable[[int], object], clock: Iterator[int], act: Any, observations: Any
-) -> Any:
-    """Call `before` with the next k of the clock, and return the actions."""
-    before(next(clock))
-    return act(observations)
 
 
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """Return the measures of each run by their names in CSV files, each of shape (runs,).
 
+    `parameters` are the arguments of the environment in which the controller ran.
+
     - `mae`: mean of |e(k)| over k = 1 to N, degC;
-    - `mae_start`, `mae_changes`, `mae_steady`: the parts of this mean, whose sum it is: of the
-      samples before `START`, of the later samples that lie less than `CHANGE` after a change of
-      the set point, and of all others;
+    - `mae_start`, `mae_changes`, `mae_steady`: three parts, degC, whose sum is `mae`: the part
+      of the samples before `START`, the part of the later samples that lie less than `CHANGE`
+      after a change of the set point, and the part of the remaining samples;
     - `ise`: integral of e^2 over k = 1 to N, degC^2 min;
     - `itae`: integral of t |e|, degC min^2, with t counted from the latest set-point change;
     - `total_variation`: valve travel, the total variation of the applied flow, from rest at 0,
@@ -167,7 +173,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     - `dead_zone_share`: share of samples with the command inside the dead zone, %;
     - `saturation_share`: share of samples with the command at or beyond a limit, %.
 
-    The last two are NaN if the actuator's numbers are drawn from ranges.
+    The two shares are NaN if the dead zone or a limit is drawn from a range.
     """
     interval = parameters.sampling_interval / 60.0  # min
     errors = np.abs(trajectory.next_error)
@@ -189,7 +195,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
 
 
 def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
-    """Return the parts of the mean error by name, degC, each of shape (runs,)."""
+    """Return the three parts of the mean error by name, degC, each of shape (runs,)."""
     errors = np.abs(trajectory.next_error)
     k = np.arange(1, len(errors) + 1)[:, np.newaxis]
     setpoint_moves = np.diff(trajectory.next_setpoint, axis=0, prepend=trajectory.setpoint[:1])
@@ -204,13 +210,16 @@ def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
 
 
 def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]:
-    """Return the shares of commands in the dead zone and at a limit, %, shape (runs,)."""
+    """Return the shares of commands in the dead zone and at a limit, %, each of shape (runs,).
+
+    `command` is in t/h, of shape (N, runs).
+    """
     if {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
         unknown = np.full(command.shape[1], np.nan)
         return {"dead_zone_share": unknown, "saturation_share": unknown}
-    u_min = parameters.u_min
-    u_max = parameters.u_max
-    edge = least_effective(parameters.dead_zone, u_min, u_max)  # as the plant judges it
+    u_min, u_max = parameters.u_min, parameters.u_max
+    # The smallest command, t/h, that the plant does not take to be inside the dead zone.
+    edge = least_effective(parameters.dead_zone, u_min, u_max)
     is_inside = np.abs(command) < edge
     is_at_limit = (command <= u_min) | (command >= u_max)
     return {
@@ -228,7 +237,7 @@ class _Steps(NamedTuple):
 
 
 def _measure_steps(setpoint: Array, output: Array) -> _Steps:
-    """Return the measures of one run, given y_d(k) and y(k), degC, shape (N,)."""
+    """Return the measures of one run from y_d(k) and y(k), degC, each of shape (N,)."""
     itae = 0.0
     overshoot = 0.0
     settling = 0.0
@@ -251,7 +260,10 @@ def _measure_steps(setpoint: Array, output: Array) -> _Steps:
 
 
 def held(setpoint: Array) -> list[tuple[int, int]]:
-    """Return the start and stop sample of each stretch of constant set point."""
+    """Return the stretches of constant set point, as the slices start:stop of the samples.
+
+    `setpoint` is y_d(k), degC, of one run, shape (samples,).
+    """
     changes = np.flatnonzero(np.diff(setpoint)) + 1
     return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
 
@@ -262,7 +274,10 @@ def mean_error(trajectory: Trajectory) -> Array:
 
 
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
-    """Return whether the last `LAST` errors of each run are all within `SETTLING_BAND`."""
+    """Return whether each run has settled, shape (runs,).
+
+    A run has settled if its last `LAST` errors are all within `SETTLING_BAND` of the set point.
+    """
     setpoint = trajectory.setpoint[-LAST:]
     output = trajectory.output[-LAST:]
     is_within = np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint)

@@ -1,6 +1,6 @@
-"""Define the cases, the options that choose a plant, and designs of other plants.
+"""Define the cases, the options that choose a plant, and random designs of plants.
 
-A design is a set of plants around the paper's: a grid over delay and gain, or drawn at random.
+A case is a plant, a set point and a length. A design is a list of plants around one plant.
 """
 
 import json
@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -36,52 +36,64 @@ class Scenario:
         return Parameters(**self.arguments)
 
 
-class _PaperPlant(NamedTuple):
-    """A plant of the paper, as part of a scenario's name and title."""
-
-    suffix: str
-    preset: str
-    title: str
-
-
-# The text of the paper describes the plants; only its figures show the set point. Two set
-# points are used here: the environment's square wave between +5 and -5 degC, 300 samples each,
-# over two periods; and a step to 5 degC.
-_PAPER_PLANTS = (
-    _PaperPlant("", "paper", "dead zone 5 t/h, no noise (Figs 5 and 10)"),
-    _PaperPlant("-dead-zone-7", "dead-zone-7", "dead zone 7 t/h, no noise (Figs 6 and 7)"),
-    _PaperPlant("-noise", "noisy", "dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)"),
-)
 SETPOINTS = (
     Scenario("square", "square wave", 1200, {}),
     Scenario("constant", "constant set point", 600, {"setpoint": 5.0}),
 )
-"""The set points of the paper's cases, on the environment's default plant."""
+"""The set points of the paper's cases, on the environment's default plant.
 
+The text of the paper describes the plants; only its figures show the set point. Two set points
+are used here: the environment's square wave between +5 and -5 degC, 300 samples each, over two
+periods; and a step to 5 degC.
+"""
 
-def _paper_scenarios() -> dict[str, Scenario]:
-    """Return every set point on every plant of the paper, and steps of the load, by name."""
-    scenarios = [
-        Scenario(
-            setpoint.name + plant.suffix,
-            f"{setpoint.title}, {plant.title}",
-            setpoint.samples,
-            {**PRESETS[plant.preset], **setpoint.arguments},
-        )
-        for setpoint in SETPOINTS
-        for plant in _PAPER_PLANTS
-    ]
+_CONSTANT = SETPOINTS[1].arguments
+SCENARIOS = {
+    "square": Scenario(
+        "square",
+        "square wave, dead zone 5 t/h, no noise (Figs 5 and 10)",
+        1200,
+        PRESETS["paper"],
+    ),
+    "square-dead-zone-7": Scenario(
+        "square-dead-zone-7",
+        "square wave, dead zone 7 t/h, no noise (Figs 6 and 7)",
+        1200,
+        PRESETS["dead-zone-7"],
+    ),
+    "square-noise": Scenario(
+        "square-noise",
+        "square wave, dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)",
+        1200,
+        PRESETS["noisy"],
+    ),
+    "constant": Scenario(
+        "constant",
+        "constant set point, dead zone 5 t/h, no noise (Figs 5 and 10)",
+        600,
+        {**PRESETS["paper"], **_CONSTANT},
+    ),
+    "constant-dead-zone-7": Scenario(
+        "constant-dead-zone-7",
+        "constant set point, dead zone 7 t/h, no noise (Figs 6 and 7)",
+        600,
+        {**PRESETS["dead-zone-7"], **_CONSTANT},
+    ),
+    "constant-noise": Scenario(
+        "constant-noise",
+        "constant set point, dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)",
+        600,
+        {**PRESETS["noisy"], **_CONSTANT},
+    ),
     # A boiler's daily duty. At 5 degC the required flow stays outside the dead zone.
-    load = Scenario(
+    "load": Scenario(
         "load",
         "load steps within ±1.5 °C at a held set point, dead zone 5 t/h, no noise",
         1200,
-        {"setpoint": 5.0, "disturbance_amplitude": 1.5, "disturbance_interval": 200.0},
-    )
-    return {scenario.name: scenario for scenario in [*scenarios, load]}
-
-
-SCENARIOS = _paper_scenarios()
+        {**_CONSTANT, "disturbance_amplitude": 1.5, "disturbance_interval": 200.0},
+    ),
+}
+"""The cases of the paper, and steps of the load, by name."""
 PRESET_SCENARIOS = {
     name: Scenario(name, f"preset {name}", 1200, dict(arguments))
     for name, arguments in PRESETS.items()
@@ -91,7 +103,7 @@ PRESET_SCENARIOS = {
 @options
 @dataclass(frozen=True, kw_only=True)
 class PlantOptions:
-    """Options that choose the plant: from a file, a preset or single arguments."""
+    """Options that choose the plant: by a file, a preset or single arguments."""
 
     plant: Path | None = None
     """JSON file with arguments of the environment, such as the plant.json that
@@ -109,7 +121,7 @@ class PlantOptions:
         return ", ".join(filter(None, [self.preset, file, *self.set]))
 
     def words(self) -> list[str]:
-        """Return the words of a command line that make the same choice."""
+        """Return the words of a command line that choose the same plant."""
         words: list[str] = []
         if self.preset:
             words += ["--preset", self.preset]
@@ -130,7 +142,7 @@ class PlantOptions:
             return default
         setpoints: tuple[Scenario, ...] = SETPOINTS
         if {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments):
-            setpoints = (Scenario("run", "its own set point", 1200, {}),)
+            setpoints = (Scenario("run", "the set point of the plant's arguments", 1200, {}),)
         return {
             setpoint.name: Scenario(
                 setpoint.name,
@@ -167,16 +179,16 @@ class PlantOptions:
             a = Parameters.of_environment(arguments).a
             if abs(slowest_pole(a) or 0.0) > 1.0:
                 raise ValueError(
-                    "a must not have a root beyond the unit circle, as nothing holds such a "
-                    f"plant, got {list(a)}"
+                    "a must not have a root beyond the unit circle, as no controller of this "
+                    f"checkout holds such a plant, got {list(a)}"
                 )
-        except (TypeError, ValueError) as error:  # the first: of an unknown argument
+        except (TypeError, ValueError) as error:  # A TypeError names an unknown argument.
             raise UsageError(f"{', '.join(options)}: {error}") from error
         return arguments
 
 
-# Ranges of the random plants of sweeps and of training. With a gain factor below 0.74, 5 degC
-# is out of the flow's reach.
+# Ranges of the random plants of sweeps, by argument of the environment. With a gain factor
+# below 0.74, a set point of 5 degC is out of the flow's reach.
 SPANS = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),
@@ -184,27 +196,31 @@ SPANS = {
     "gain_factor": (0.75, 1.6),
     "time_constant_factor": (0.5, 2.0),
 }
+# The factors that drift in half of the plants, and the argument for the drift of each factor.
+DRIFTS = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_drift"}
 
 
 def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
     """Return `count` plants from a Latin hypercube over `SPANS`.
 
-    The second half of them drift: over `samples` samples, their gain and time constant move to
-    other values within the spans.
+    The second half of the plants drift: over `samples` samples, the factors of gain and time
+    constant move to other values within `SPANS`. A plant is a dictionary of arguments of the
+    environment. `seed` is the seed of the hypercube.
     """
     from scipy.stats.qmc import LatinHypercube  # here: slow to import
 
-    drifts = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_drift"}
     # A column for each argument, then one for each factor at the end of its drift.
-    low, high = np.array([*SPANS.values(), *(SPANS[name] for name in drifts)]).T
-    shares = LatinHypercube(len(low), rng=np.random.default_rng(seed)).random(count)
+    spans = [*SPANS.values(), *(SPANS[factor] for factor in DRIFTS)]
+    low, high = np.array(spans).T
+    shares = LatinHypercube(len(spans), rng=np.random.default_rng(seed)).random(count)
+    rows = (low + shares * (high - low)).round(4).tolist()
     plants: list[Arguments] = []
-    for row in (low + shares * (high - low)).round(4).tolist():
+    for number, row in enumerate(rows):
         plant = dict(zip(SPANS, row, strict=False))
         plant["delay"] = round(plant["delay"])
-        if len(plants) >= count // 2:
+        if number >= count // 2:
             final_factors = row[len(SPANS) :]
-            for (factor, drift), final in zip(drifts.items(), final_factors, strict=True):
+            for (factor, drift), final in zip(DRIFTS.items(), final_factors, strict=True):
                 plant[drift] = final / plant[factor]
             plant["drift_samples"] = samples
         plants.append(plant)
@@ -214,9 +230,9 @@ def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
 def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
     """Return a design around the paper's plant, moved to another plant.
 
-    The plants differ from `plant` by the same factors as those of the design from the paper's:
-    in delay, dead zone, the factors of gain and time constant, and in the noise variance as a
-    share of the square of the temperature change that the flow can cause.
+    The moved plants differ from `plant` by the same factors as the plants of the design differ
+    from the paper's: in delay, dead zone, and the factors of gain and time constant. The noise
+    variance keeps its ratio to the square of the temperature change that the flow can cause.
     """
     scales = _scales(Parameters(**plant))
     paper_scales = _scales(Parameters())
@@ -233,7 +249,7 @@ def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
 
 
 def _scales(plant: Parameters) -> dict[str, float]:
-    """Return what the values of a design are multiples of, by their names in `SPANS`."""
+    """Return the numbers of a plant that the values of a design scale with, by argument."""
     model = nominal(plant)
     reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0  # degC
     scales = {**vars(model.numbers), "noise_variance": reach**2}

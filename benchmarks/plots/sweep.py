@@ -29,7 +29,7 @@ from benchmarks.lib.pictures import (
 from mptc_gym import Parameters
 
 NEAR = 1.05  # An error counts as near the lowest achievable one up to this multiple.
-OFTEN = 0.5  # share of the runs on a plant from which a mark of the map is drawn
+OFTEN = 0.5  # share of the runs on a plant from which on a mark of the map is drawn
 CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
 COLOUR_MAP = "viridis_r"
 NO_RATIO = "0.85"  # colour of a plant without a lowest achievable error
@@ -48,7 +48,7 @@ def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     path : Path
         The PNG file.
     nominal : Parameters
-        The plant around which the others are.
+        The plant from which the other plants differ.
     """
     plants = plant_medians(runs)
     if "dead_zone" in runs:
@@ -62,15 +62,15 @@ def plant_medians(runs: pd.DataFrame) -> pd.DataFrame:
 
     The columns are `agent`, `plant`, `delay`, `gain_factor`, `ratio` (that of the median run)
     and the shares of runs that oscillate (`oscillates`) and that are no better than an idle
-    valve (`useless`).
+    valve (`useless`). `runs` are those of `draw`.
     """
     groups = runs.groupby(["agent", "plant"], sort=False)
     plants = groups[["delay", "gain_factor"]].first()
     plants["ratio"] = groups["ratio"].median()
     plants[["oscillates", "useless"]] = groups[["oscillates", "useless"]].mean()
     plants = plants.reset_index()
-    plants["middle"] = plants.groupby("agent")["ratio"].transform("median")
-    return plants.sort_values("middle", kind="stable").drop(columns="middle")
+    medians = plants.groupby("agent")["ratio"].median()
+    return plants.sort_values("agent", key=lambda names: names.map(medians), kind="stable")
 
 
 def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
@@ -79,44 +79,43 @@ def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
     `plants` are those of `plant_medians`. Plants without a ratio are left out.
     """
     plants = plants.dropna(subset=["ratio"])
-    agents = list(plants["agent"].unique())
-    styles = looks(agents)
+    styles = looks(list(plants["agent"].unique()))
     with open_picture(path, 4.6, sorted_finding(plants)) as figure:
         axes = figure.subplots()
-        for agent in agents:
+        for agent, (colour, marker) in styles.items():
             ratios = np.sort(plants.loc[plants["agent"] == agent, "ratio"])
             shares = 100.0 * (np.arange(len(ratios)) + 1.0) / len(ratios)
-            colour, marker = styles[agent]
             look: Any = {"color": colour, "marker": marker, "ms": 5, "markevery": 0.1}
             axes.plot(shares, excess(ratios), label=label(agent), linewidth=1.3, **look)
-        if agents:
+        if styles:
             scale_by_ratio(axes, "y", plants["ratio"])
-            handles, texts = axes.get_legend_handles_labels()
             # The controller with the largest errors is the uppermost line.
-            figure.legend(handles[::-1], texts[::-1], loc="outside right center")
+            figure.legend(loc="outside right center", reverse=True)
         axes.set_xlim(0.0, 100.0)
         axes.set_xlabel("share of the plants (%), sorted by the error of each controller")
         axes.set_ylabel(RATIO_LABEL)
 
 
 def sorted_finding(plants: pd.DataFrame) -> str:
-    """Return a sentence on the 90th percentiles of the error ratios over the plants."""
+    """Return a sentence on the 90th percentiles of the error ratios over the plants.
+
+    It names the two controllers with the smallest percentiles and the one with the largest.
+    """
     ratios = plants.groupby("agent")["ratio"].quantile(0.9).sort_values()
     if ratios.empty:
         return "No plant has a lowest achievable error"
     texts = [f"{ratio:.2f} for {label(str(agent))}" for agent, ratio in ratios.items()]
-    finding = f"On nine plants out of ten, the error ratio is at most {texts[0]}"
-    if len(texts) > 2:
-        finding += f", {texts[1]}"
+    finding = "On nine plants out of ten, the error ratio is at most "
+    finding += ", ".join(texts[:-1][:2])
     if len(texts) > 1:
-        finding += f" and {texts[-1]}"
-    return finding
+        finding += " and "
+    return finding + texts[-1]
 
 
 def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     """Draw the error ratio over delay and gain, a panel for each controller, the best first.
 
-    `plants` are those of `plant_medians`.
+    `plants` are those of `plant_medians`, and `nominal` is marked.
     """
     agents = list(plants["agent"].unique())
     names = [label(agent) for agent in agents]
@@ -139,38 +138,41 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
 
 
 def map_finding(plants: pd.DataFrame) -> str:
-    """Return a sentence on the shares of plants with nearly the lowest achievable error."""
+    """Return a sentence on the shares of plants with nearly the lowest achievable error.
+
+    It names the two controllers with the largest shares.
+    """
     with_ratio = plants.dropna(subset=["ratio"])
     is_near = with_ratio["ratio"] <= NEAR
     shares = is_near.groupby(with_ratio["agent"]).mean()
     shares = shares.sort_values(ascending=False, kind="stable")
     if shares.empty:
         return "Where each controller oscillates"
-    first = str(shares.index[0])
+    names = [label(str(agent)) for agent in shares.index]
+    percentages = [percent(share) for share in shares]
     finding = (
-        f"{label(first)} is within {percent(NEAR - 1.0)} of the lowest achievable error on "
-        f"{percent(shares[first])} of the plants"
+        f"{names[0]} is within {percent(NEAR - 1.0)} of the lowest achievable error on "
+        f"{percentages[0]} of the plants"
     )
-    if len(shares) == 1:
-        return finding
-    second = str(shares.index[1])
-    finding += f", {label(second)} on {percent(shares[second])}"
-    if len(shares) == 2:
-        return finding
-    return f"{finding}; no other controller is on more"
+    if len(names) > 1:
+        finding += f", {names[1]} on {percentages[1]}"
+    if len(names) > 2:
+        finding += "; no other controller is on more"
+    return finding
 
 
 def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) -> None:
-    """Draw a cell for each plant, in the colour of its error ratio, and marks for failures."""
-    cells = plants.pivot_table(
-        index="gain_factor", columns="delay", values="ratio", dropna=False
-    )
+    """Draw a cell for each plant, in the colour of its error ratio, and marks for failures.
+
+    `plants` are the rows of one controller; `classes` maps a ratio to a colour.
+    """
+    cells = plants.pivot(index="gain_factor", columns="delay", values=["ratio", "useless"])
+    ratios = cells["ratio"]
+    useless = cells["useless"].where(cells["useless"] >= OFTEN)  # NaN is transparent
     axes.set_facecolor(NO_RATIO)
     axes.grid(visible=False)
-    axes.pcolormesh(cells.columns, cells.index, cells, norm=classes, cmap=COLOUR_MAP)
-    useless = plants.pivot_table(index="gain_factor", columns="delay", values="useless")
-    red = useless.where(useless >= OFTEN)  # NaN, which is transparent, elsewhere
-    axes.pcolormesh(red.columns, red.index, red, cmap=ListedColormap([USELESS]))
+    axes.pcolormesh(ratios.columns, ratios.index, ratios, norm=classes, cmap=COLOUR_MAP)
+    axes.pcolormesh(ratios.columns, ratios.index, useless, cmap=ListedColormap([USELESS]))
     marked = plants[(plants["oscillates"] >= OFTEN) & (plants["useless"] < OFTEN)]
     axes.plot(marked["delay"], marked["gain_factor"], **OSCILLATES)
 

@@ -1,0 +1,1 @@
+"""Test the paper's claims, each on many runs."""

@@ -1,0 +1,1 @@
+"""Compare controllers on the cases of the paper and on the presets."""

@@ -1,0 +1,1 @@
+"""List all controllers, with one record for each."""

@@ -1,0 +1,1 @@
+"""Hold scripts to copy, which train policies."""

@@ -1,0 +1,1 @@
+"""Hold what all commands share: the command line, parallel tasks, reports, statistics."""

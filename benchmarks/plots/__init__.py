@@ -1,0 +1,1 @@
+"""Draw the pictures of sweeps and the film."""
