@@ -9,8 +9,6 @@ from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
-from mptc_gym.acting import rollout
-from mptc_gym.adapters import adapted
 from numpy.typing import NDArray
 
 from benchmarks.lib.command import Count, Names, Parameter, command, options
@@ -18,6 +16,7 @@ from benchmarks.lib.errors import UnfinishedError
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.lib.storage import out_folder
 from mptc_gym import PRESETS, evaluate
+from mptc_gym.scoring.rollout import rollout
 
 SAMPLES = 1200  # in an episode
 EPISODES = 100  # in a data set
@@ -113,7 +112,7 @@ def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]
         actions.append(np.clip(controller.act(observations), -1.0, 1.0).astype(np.float32))
         return actions[-1]
 
-    plants = adapted(make_plants(len(seeds), SAMPLES, **arguments))
+    plants = make_plants(len(seeds), SAMPLES, **arguments)
     samples = list(rollout(plants, act, SAMPLES, seeds))
     observations_of_all = np.stack([sample.observations for sample in samples], axis=1)
     actions_of_all = np.stack(actions, axis=1)
