@@ -14,7 +14,7 @@ FARTHEST = 1e12  # degC; temperatures beyond it, and NaN, are drawn at the edge
 
 
 class Sample(NamedTuple):
-    """The signals of one sample."""
+    """The signals of sample k, after the step from sample k-1."""
 
     setpoint: float  # y_d(k), degC
     output: float  # y(k), degC
