@@ -83,8 +83,8 @@ def many_actions(
     num_envs
         Number of plants.
     ignored
-        Plants whose actions are ignored, shape (num_envs,): their actions are returned as 0,
-        and need not be finite. None if no action is ignored.
+        Plants whose actions are ignored, shape (num_envs,): the results for these plants are 0,
+        and their actions need not be finite. None if no action is ignored.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Draw a record of an episode with pygame, temperatures above flows, or show it in a window."""
+"""Draw a record of an episode with pygame: temperatures above flows."""
 
 import math
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ class Label(NamedTuple):
 
 
 class Panel:
-    """A part of the picture with its own axes.
+    """A part of the picture, with axes.
 
     `place` is where the panel lies in the picture. `axis` holds the lower and the upper end of
     the vertical axis. The horizontal axis shows the samples of the record, with numbers in
@@ -169,8 +169,8 @@ def _draw_temperatures(surface: pygame.Surface, record: Record) -> None:
     panel = Panel(surface, record, TEMPERATURES, record.temperature_axis)
     panel.grid()
     panel.curve(TEMPERATURE, [sample.output for sample in record.samples], 3, held=False)
-    # The set point lies above the temperature, and is thinner, so that both can be seen where
-    # they agree.
+    # The set point lies above the temperature, and is thinner, so that both curves can be seen
+    # where both agree.
     panel.curve(SETPOINT, [sample.setpoint for sample in record.samples], 2, held=True)
     newest = record.samples[-1]
     minutes = record.k * record.sampling_interval / 60.0
@@ -231,14 +231,17 @@ def show(record: Record, fps: float, viewer: object) -> None:
 
 
 def hide(viewer: object) -> None:
-    """Close the window, unless another environment shows its pictures in it."""
+    """Close the window, unless another environment shows pictures in the window."""
     viewers.discard(viewer)
     if not viewers:
         pygame.display.quit()
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return the multiples of 1, 2 or 5 times a power of ten in a range, 3 to 7 of them."""
+    """Return some 3 to 7 round numbers from `low` to `high`.
+
+    The numbers are multiples of 1, 2 or 5 times a power of ten.
+    """
     smallest_step = (high - low) / 6.0
     power = 10.0 ** math.floor(math.log10(smallest_step))
     step = next(

@@ -21,7 +21,7 @@ _LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
 
 class Argument(NamedTuple):
-    """Declaration of an argument of the environment, apart from its name and type."""
+    """Declaration of an argument of the environment, without the argument's name and type."""
 
     default: Any
     check: checks.Check  # returns a valid value in plain Python types, or raises a ValueError
@@ -40,7 +40,8 @@ def _arg(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
 class PlantNumbers(Generic[Value]):
     """The numbers of a plant that can differ from episode to episode.
 
-    As arguments they are of type `Number`: a number, or a range from which each reset draws.
+    As arguments, the numbers are of type `Number`: a number, or a range from which each reset
+    draws.
     During an episode, the numbers are floats for one plant, and arrays for many plants.
 
     Field i takes the i-th random number of a reset. So the order of the fields never changes,
@@ -82,7 +83,7 @@ class PlantNumbers(Generic[Value]):
     )
 
     def chosen(self, names: Iterable[str]) -> dict[str, Value]:
-        """Return the numbers of these names."""
+        """Return the plant numbers with these names, by name."""
         return {name: getattr(self, name) for name in names}
 
 
@@ -105,7 +106,7 @@ class Parameters(PlantNumbers[Number]):
     Raises
     ------
     ValueError
-        If an argument is out of range. The message names the argument, its value and what is
+        If an argument is out of range. The message names the argument, the value and what is
         allowed.
     """
 
@@ -124,7 +125,7 @@ class Parameters(PlantNumbers[Number]):
         1200, checks.duration, "samples", "duration of the drifts of gain and time constant"
     )
     sampling_interval: float = _arg(8.0, checks.positive, "s", "scale of the time axis only")
-    # The paper plots the set point without stating its values.
+    # The paper plots the set point, but does not state the values.
     setpoint: str | float | Sequence[float] = _arg(
         "square",
         checks.setpoint,
@@ -145,7 +146,7 @@ class Parameters(PlantNumbers[Number]):
         'P: "square" repeats every P samples; "random" holds a level for P/6 to P/2 samples, '
         "uniformly",
     )
-    # The observation. By default it is the six inputs of the paper's network: y_d(k), y_d(k-1),
+    # The default observation is the six inputs of the paper's network: y_d(k), y_d(k-1),
     # y_d(k-2), e(k), e(k-1), e(k-2).
     setpoint_window: int = _arg(
         3, checks.samples, "samples", "number of latest set points observed"
@@ -226,8 +227,9 @@ class Parameters(PlantNumbers[Number]):
         lowest_u_max, highest_u_max = self.range_of("u_max")
         if highest_u_min >= lowest_u_max:
             reject("u_min", self.u_min, f"below u_max = {self.u_max}")
-        # The largest magnitude of a command, max(|u_min|, |u_max|), where the draws make it
-        # smallest. Over a range [low, high], the smallest magnitude is max(low, -high, 0).
+        # The reach is the largest magnitude of a command, max(|u_min|, |u_max|), for the draws
+        # that make this magnitude smallest. Over a range [low, high], the smallest magnitude is
+        # max(low, -high, 0).
         reach = max(lowest_u_min, -highest_u_min, lowest_u_max, -highest_u_max, 0.0)
         _, largest_dead_zone = self.range_of("dead_zone")
         if largest_dead_zone > reach:
@@ -264,7 +266,7 @@ class Parameters(PlantNumbers[Number]):
 
     @cached_property
     def lowest(self) -> PlantNumbers[float]:
-        """All plant numbers, with the lowest value of those that are drawn."""
+        """All plant numbers, with the low end in place of a range."""
         return PlantNumbers(**{name: self.range_of(name)[0] for name in PLANT_NUMBERS})
 
     @cached_property

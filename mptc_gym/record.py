@@ -10,7 +10,7 @@ from mptc_gym.parameters import PlantNumbers
 
 SPAN = 200  # fewest samples that a picture spans
 LONGEST = 2000  # most samples that a picture spans, even with a long delay
-FARTHEST = 1e12  # degC; temperatures beyond it, and NaN, are drawn at the edge
+FARTHEST = 1e12  # degC; temperatures beyond this value, and NaN, are drawn at the edge
 
 
 class Sample(NamedTuple):
