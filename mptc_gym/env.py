@@ -294,8 +294,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         info = dict.fromkeys(INFO, 0.0)
         info["setpoint"] = setpoint
         info["error"] = setpoint
-        if self._has_more_info:
-            self._add_more_info(info, 0.0)
+        if self.parameters.is_disturbed:
+            info["disturbance"] = 0.0
+        info |= self._plant.factors
         info |= numbers.chosen(self.parameters.ranges)
         return np.fromiter(self._window, _FLOAT32, size), info
 
@@ -374,7 +375,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             "noise": noise,
         }
         if self._has_more_info:
-            self._add_more_info(info, load)
+            if self.parameters.is_disturbed:
+                info["disturbance"] = load
+            info |= self._plant.factors
         if self._record is not None:
             self._record.add(setpoint, output, command, applied)
             if self.render_mode == "human":
@@ -417,12 +420,6 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
 
             drawing.hide(self)
         self._record = None
-
-    def _add_more_info(self, info: dict[str, float], load: float) -> None:
-        """Add the load, degC, and the factors of gain and time constant, if they can change."""
-        if self.parameters.is_disturbed:
-            info["disturbance"] = load
-        info |= self._plant.factors
 
 
 MiddlePointEnv.__doc__ = insert_table(MiddlePointEnv.__doc__)

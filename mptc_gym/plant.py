@@ -133,6 +133,7 @@ class Plant:
         self._actuator = edge, u_min, u_max, (u_max - u_min) / 2.0
         self._numbers = numbers
         self._drifts = parameters.drifts
+        self.factors: dict[str, float] = {}
         self._age = 0
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()
@@ -182,9 +183,10 @@ class Plant:
     def _update_dynamics(self) -> None:
         """Update the dynamics to the plant's age."""
         factors = self._dynamics.factors(self._numbers, self._age)
+        if self._drifts:
+            self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
         self._alpha = tuple(enumerate(alpha))
-        self.factors = dict(zip(FACTORS, factors, strict=True)) if self._drifts else {}
 
 
 class PlantBatch:
@@ -216,6 +218,7 @@ class PlantBatch:
         self._clock = 0
         self._starts = np.zeros(num_envs if parameters.drifts else (), np.int64)
         self._next_update = 0  # the clock when the dynamics change next
+        self.factors: dict[str, Values] = {}
         self._update_dynamics()
         order = len(self._alpha)
         self._outputs = deque(np.zeros((order, num_envs)), maxlen=order)  # newest first
@@ -303,7 +306,6 @@ class PlantBatch:
         ages = self._clock - self._starts
         last_changes = ages // DRIFT_INTERVAL * DRIFT_INTERVAL
         factors = self._dynamics.factors(self.numbers, last_changes)
-        self.factors: dict[str, Values] = {}
         if self._parameters.drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
