@@ -1,7 +1,7 @@
 """Implement what the vector environments share: arguments, masks, time limits, resets, infos.
 
-`MiddlePointVectorEnv` adds the plants in NumPy arrays, and `MiddlePointTorchEnv` in PyTorch
-tensors.
+`MiddlePointVectorEnv` adds plants in NumPy arrays, and `MiddlePointTorchEnv` adds plants in
+PyTorch tensors.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mptc_gym.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.env import INFO, HasPlainSpec, observation_space
 from mptc_gym.parameters import Parameters
+from mptc_gym.plant import FACTORS
 from mptc_gym.plant_state import PlantState, plant_state
 from mptc_gym.signals import FOREVER
 
@@ -27,15 +28,25 @@ Array = Any  # of NumPy or PyTorch, depending on the environment
 Infos = dict[str, Any]
 Mask = NDArray[np.bool_]  # of plants, shape (num_envs,)
 
-FACTORS = ("gain_factor", "time_constant_factor")
-
 
 class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
-    """n plants that advance together: the part that does not depend on the array library."""
+    """n plants that advance together: the part that does not depend on the array library.
 
-    _where: Any  # numpy.where or torch.where
-    _shown: Any  # the observations; `present()` returns copies of them
-    _zeros: Array  # shape (num_envs,), read-only
+    A subclass sets these attributes:
+
+    Attributes
+    ----------
+    _where : callable
+        `numpy.where` or `torch.where`.
+    _window
+        The observations; `_window.present()` returns a copy of the present ones.
+    _zeros : array
+        Zeros of the library, shape (num_envs,), only to be read.
+    """
+
+    _where: Any
+    _window: Any
+    _zeros: Array
 
     def __init__(
         self,
@@ -50,7 +61,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         if not is_count(limit, -1) or limit == 0:
             allowed = "an integer of at least 1, or None or -1 for no limit"
             reject("max_episode_steps", max_episode_steps, allowed)
-        self._limit = FOREVER if limit == -1 else min(FOREVER, int(limit))
+        self._limit = FOREVER if limit == -1 else min(FOREVER, int(limit))  # samples
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -62,15 +73,12 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         # Keys of the infos of every step, and of their masks.
-        names = [*INFO]
+        self._names = [*INFO]
         if self.parameters.is_disturbed:
-            names.append("disturbance")
-        self._factor_names: tuple[str, ...] = ()
+            self._names.append("disturbance")
         if self.parameters.drifts:
-            self._factor_names = FACTORS
-        self._names = (*names, *self._factor_names)
-        self._masks = tuple(f"_{name}" for name in self._names)
-        self._drawn_numbers: dict[str, Array] = {}  # the arguments that are ranges, by name
+            self._names += FACTORS
+        self._masks = [f"_{name}" for name in self._names]
         # Steps of the environment. A plant's k is the clock minus the start of its episode.
         self._clock = 0
         self._starts = np.zeros(num_envs, np.int64)
@@ -85,23 +93,25 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         Parameters
         ----------
         seed
-            Restarts the random numbers; see the class docstring. Without it, they continue.
+            Restarts the random numbers; see the docstring of the class. Without a seed, the
+            random numbers continue.
         options
             `reset_mask`, a bool array of shape (num_envs,), selects the plants to reset. The
-            first reset must include all plants.
+            first reset must include all plants. `MiddlePointTorchEnv` also takes `signals`.
 
         Returns
         -------
         observations : array
-            Shape (num_envs, size). Those of plants that are not reset are their last ones.
+            The observations, shape (num_envs, size). Plants that are not reset keep their last
+            observation.
         infos : dict
-            Arrays of shape (num_envs,), and their masks, which are False for plants that are
-            not reset. Several masks may be the same array.
+            The infos, in arrays of shape (num_envs,), and their masks, which are False for
+            plants that are not reset. Several masks may be the same array.
 
         Raises
         ------
         ValueError
-            If an argument is invalid. Nothing is then changed.
+            If an argument is invalid. The environment is then unchanged.
         ResetNeeded
             If the first reset does not include all plants.
         """
@@ -109,10 +119,10 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             reject("options", options, "a dict or None")
         mask = self._checked_mask(options or {})
         if not self._first_end and not mask.all():
-            raise ResetNeeded("reset all environments before some of them")
+            raise ResetNeeded("the first reset must include all environments")
         self._prepare(mask, seed, options or {})
         infos = self._restart(mask, {})
-        return self._shown.present(), infos
+        return self._window.present(), infos
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
         """Apply normalised actions for one sample.
@@ -120,21 +130,23 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         Parameters
         ----------
         actions
-            Shape (num_envs, 1).
+            The actions a(k), shape (num_envs, 1).
 
         Returns
         -------
         observations : array
-            Shape (num_envs, size).
+            The observations at k+1, shape (num_envs, size).
         rewards, terminations, truncations : array
-            Shape (num_envs,). No episode terminates.
+            The rewards of e(k+1) and the flags, shape (num_envs,). No episode terminates.
         infos : dict
-            Arrays of shape (num_envs,), and their masks. Several masks may be the same array.
+            The infos at k+1, in arrays of shape (num_envs,), and their masks. Several masks may
+            be the same array.
 
         Raises
         ------
         ValueError
-            If the actions have another shape or are not finite. Nothing is then changed.
+            If the actions have another shape or are not finite. The environment is then
+            unchanged.
         ResetNeeded
             Before the first reset; with autoreset disabled, also if an episode has ended.
         """
@@ -143,58 +155,56 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         ended = self._ended
         if ended is not None and self.autoreset_mode is AutoresetMode.DISABLED:
             which = np.flatnonzero(ended)
-            raise ResetNeeded(f"episodes of environments {which} have ended: reset them")
+            raise ResetNeeded(f"reset environments {which}, whose episodes have ended")
         a = self._checked_actions(actions)
         if ended is not None and ended.all():
             infos = self._restart(ended, {})
-            rewards = self._zeros + 0  # a copy
-            terminations = self._flags(~ended)
-            truncations = self._flags(~ended)
-            return self._shown.present(), rewards, terminations, truncations, infos
+            no_rewards = self._zeros + 0  # a copy
+            terminations, truncations = self._as_array(~ended), self._as_array(~ended)
+            return self._window.present(), no_rewards, terminations, truncations, infos
         self._clock += 1
-        step = self._advance(a)
+        returned = self._advance(a)
         if self._clock < self._first_end:
-            return step
-        return self._end_episodes(*step)
+            return returned
+        return self._end_episodes(*returned)
 
     def _end_episodes(
         self, observations: Array, rewards: Array, terminations: Array, _: Array, infos: Infos
     ) -> tuple[Array, Array, Array, Array, Infos]:
-        """Return what a step returns, where episodes end or have ended at the previous step.
+        """Return what a step returns where episodes end, or have ended at the previous step.
 
-        The arguments are what it would return if no episode ended.
+        The arguments are what the step would return if no episode ended.
         """
         ended = self._clock - self._starts >= self._limit
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            flags = self._flags(ended)
+            flags = self._as_array(ended)
             final_info = {name: self._where(flags, infos[name], 0) for name in self._names}
-            final_info |= dict.fromkeys(self._masks, flags)
-            infos["final_info"] = final_info
+            infos["final_info"] = final_info | dict.fromkeys(self._masks, flags)
             infos["_final_info"] = flags
             infos["final_obs"] = self._final(ended, observations)
             infos["_final_obs"] = flags
             self._restart(ended, infos)
-            return self._shown.present(), rewards, terminations, self._flags(ended), infos
-        if self._ended is not None:  # since the previous step: this step resets them
-            rewards = self._where(self._flags(self._ended), 0, rewards)
+            return self._window.present(), rewards, terminations, self._as_array(ended), infos
+        if self._ended is not None:  # at the previous step: this step resets these plants
+            rewards = self._where(self._as_array(self._ended), 0, rewards)
             self._restart(self._ended, infos)
-            observations = self._shown.present()
+            observations = self._window.present()
             ended = self._clock - self._starts >= self._limit
         self._ended = ended if ended.any() else None
-        return observations, rewards, terminations, self._flags(ended), infos
+        return observations, rewards, terminations, self._as_array(ended), infos
 
     def _restart(self, mask: Mask, infos: Infos) -> Infos:
-        """Begin an episode of some plants; put their infos at k = 0 in the infos of a step."""
+        """Begin an episode of some plants, and return infos that hold k = 0 for these plants.
+
+        `infos` are the infos of a step, which go on for the other plants, or an empty dict.
+        """
         self._starts[mask] = self._clock
         self._first_end = int(self._starts.min()) + self._limit
         if self._ended is not None:
             still_ended = self._ended & ~mask
             self._ended = still_ended if still_ended.any() else None
-        flags = self._flags(mask)
+        flags = self._as_array(mask)
         first_infos = self._begin(mask)
-        for name in self.parameters.ranges:
-            present = self._drawn_numbers.get(name, 0)
-            self._drawn_numbers[name] = self._where(flags, first_infos[name], present)
         for name in {*self._names, *first_infos}:
             values = first_infos.get(name, self._zeros)
             infos[name] = self._where(flags, values, infos.get(name, 0))
@@ -204,16 +214,21 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     def plant_state(self) -> PlantState:
         """Return what a teacher may know of each plant at the present sample.
 
-        These are delay (samples), dead zone (t/h), gain (degC per t/h) and time constant (s),
-        with their drift, and the load (degC), each of shape (num_envs,). A policy cannot see
-        them, but a critic or a teacher in training may. They are of the episode that `step` or
-        `reset` has just returned an observation of. Before the first reset, a `ResetNeeded` is
-        raised.
+        The state holds delay (samples), dead zone (t/h), gain (degC per t/h) and time constant
+        (s), as they have drifted, and the load (degC), each of shape (num_envs,). A policy
+        cannot see this state, but a critic or a teacher in training may. The present sample is
+        that of the observation which `step` or `reset` has just returned.
+
+        Raises
+        ------
+        ResetNeeded
+            Before the first reset.
         """
         if not self._first_end:
             raise ResetNeeded("call reset before plant_state")
-        ages = self._from_host(self._clock - self._starts)
-        return plant_state(self.parameters, self._drawn_numbers, ages, self._present_load())
+        ages = self._zeros + self._as_array(self._clock - self._starts)
+        numbers, load = self._hidden_state()
+        return plant_state(self.parameters, numbers, ages, load)
 
     def _checked_mask(self, options: Mapping[str, Any]) -> Mask:
         """Return the mask of the plants to reset: all, unless the options say otherwise."""
@@ -233,33 +248,33 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         return mask.copy()
 
     @abstractmethod
-    def _flags(self, mask: Mask) -> Array:
-        """Return a mask as a new array of the environment's library."""
+    def _as_array(self, values: NDArray[Any]) -> Array:
+        """Return a mask or integers, shape (num_envs,), in a new array of the library."""
 
     @abstractmethod
-    def _from_host(self, values: NDArray[Any]) -> Array:
-        """Return numbers, shape (num_envs,), as an array of the environment's library."""
+    def _hidden_state(self) -> tuple[dict[str, Array], Array]:
+        """Return what infos and observations of the present sample do not show.
 
-    @abstractmethod
-    def _present_load(self) -> Array:
-        """Return the load w at the present sample, degC, shape (num_envs,)."""
+        These are the plant numbers that are ranges, by name, and the load w, degC, in arrays of
+        shape (num_envs,).
+        """
 
     @abstractmethod
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Check the other arguments of `reset`, then apply them."""
+        """Check seed and options of a `reset` of the plants in the mask, then apply both."""
 
     @abstractmethod
     def _begin(self, mask: Mask) -> dict[str, Array]:
-        """Begin an episode of some plants; return those of their infos at k = 0 that are not 0.
+        """Begin an episode of the plants in the mask; return the infos at k = 0 that are not 0.
 
-        The arrays have the shape (num_envs,); only the elements of these plants are used.
+        The arrays have the shape (num_envs,); only the elements of the mask are of use.
         """
 
     @abstractmethod
     def _checked_actions(self, actions: Any) -> Array:
         """Return the actions, shape (num_envs,); 0 for plants whose episode has ended.
 
-        A ValueError is raised for actions of another shape and for those that are not finite.
+        Actions of another shape and actions that are not finite raise a ValueError.
         """
 
     @abstractmethod

@@ -1,4 +1,8 @@
-"""Check single values: each function returns a plain Python value, or raises a ValueError."""
+"""Check single values.
+
+A check takes the name of an argument and its value. It returns the value in plain Python types,
+or raises a ValueError that names the argument.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -9,32 +13,33 @@ from typing import Any, Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-# Largest magnitude of an argument. Beyond it, float32 observations and squares become
-# meaningless.
+# Largest magnitude of an argument. Larger numbers would make float32 observations and squared
+# errors meaningless.
 LARGEST: Final[Any] = 10**9
-# Far more than any plant needs. Without these limits, a mistyped number could fill the memory.
+# These limits are far above what any plant needs. Without them, a mistyped number could fill
+# the memory.
 LONGEST: Final = 10_000  # samples of a delay or of a window
 MOST_COEFFICIENTS: Final = 1_000
 MOST_PLANTS: Final = 10_000_000  # in one environment
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
 _COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
-_FLOAT64 = np.dtype(np.float64)  # faster to pass than the type
+_FLOAT64 = np.dtype(np.float64)  # faster to pass than np.float64
 _LONGEST_REPR = 80  # characters of a value in an error message
-# What arrays, tensors and Python raise if a value is not a number.
+# The exceptions of arrays, tensors and Python for a value that is not a number.
 _NOT_A_NUMBER = AttributeError, TypeError, ValueError, OverflowError, RuntimeError
 
 Number = float | Sequence[float]  # a number, or a range [low, high]
-Check = Callable[[str, Any], Any]  # of an argument's name and value; see `mptc_gym.parameters`
+Check = Callable[[str, Any], Any]  # takes the name of an argument and its value
 
 
 def reject(name: str, value: object, allowed: str) -> NoReturn:
-    """Raise a ValueError that says what an argument must be and what it is."""
+    """Raise a ValueError: the argument `name` must be `allowed`, but is `value`."""
     raise ValueError(f"{name} must be {allowed}, got {shorten(value)}") from None
 
 
 def shorten(value: object) -> str:
-    """Return the repr of a value; for a long one, its beginning and its length."""
+    """Return the repr of a value; of a long repr, the beginning and the value's length."""
     text = repr(value)
     length = ""
     if isinstance(value, list | tuple):
@@ -48,7 +53,7 @@ def shorten(value: object) -> str:
 
 
 def one_action(action: Any) -> float:
-    """Return the action of one plant, given as one number or an array of one number.
+    """Return the action of one plant as a float; the action is a number or an array of one.
 
     Raises
     ------
@@ -57,7 +62,8 @@ def one_action(action: Any) -> float:
     """
     try:
         array = action if hasattr(action, "item") else np.asarray(action)
-        checked = float(array.item() - 0.0)  # text is not a number, even if float() parses it
+        # The difference fails for text, which is not a number even if float() can parse it.
+        checked = float(array.item() - 0.0)
     except _NOT_A_NUMBER:
         checked = math.nan
     if not math.isfinite(checked):
@@ -77,8 +83,8 @@ def many_actions(
     num_envs
         Number of plants.
     ignored
-        Plants whose actions are ignored, shape (num_envs,): their actions are returned as 0,
-        and need not be finite. None if no action is ignored.
+        Plants whose actions are ignored, shape (num_envs,): the results for these plants are 0,
+        and their actions need not be finite. None if no action is ignored.
 
     Returns
     -------
@@ -96,36 +102,30 @@ def many_actions(
     checked = columns.ravel()
     if ignored is not None:
         checked[ignored] = 0.0
-    # One call shows that all are finite, unless some are huge.
+    # The sum of squares is finite if all actions are, unless an action is huge.
     if not math.isfinite(checked.dot(checked)) and not np.isfinite(checked).all():
         reject("actions", actions, "finite")
     return checked
 
 
 def _as_float64(values: Any) -> NDArray[np.float64] | None:
-    """Return numbers in a new float64 array, or None if some are not real numbers."""
+    """Return values in a new float64 array, or None if a value is not a real number."""
     try:
         array = np.asarray(values)
         if array.dtype.hasobject:
             array = np.array((array - 0.0).tolist())
-        # Text is not a number, even if NumPy parses it.
+        # This cast fails for text, which is not a number even if NumPy can parse it.
         return array.astype(_FLOAT64, casting="same_kind")
     except _NOT_A_NUMBER:
         return None
 
 
 def plain(value: Any) -> Any:
-    """Return an array as a list, and NumPy scalars, also in a list, as Python numbers."""
+    """Return an array as a list, and a scalar of NumPy, also in a list, as a Python number."""
     if isinstance(value, list | tuple):
-        return type(value)(_plain_scalar(element) for element in value)
-    if isinstance(value, np.ndarray):
+        return type(value)(map(plain, value))
+    if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    return _plain_scalar(value)
-
-
-def _plain_scalar(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        return value.item()
     return value
 
 
@@ -167,7 +167,7 @@ duration = partial(count, minimum=1, maximum=LARGEST)  # in samples
 def numbers(
     name: str, value: Any, allowed: str = _COEFFICIENTS, most: float = MOST_COEFFICIENTS
 ) -> tuple[float, ...]:
-    """Return the numbers of a list that has 1 to `most` elements."""
+    """Return the numbers of a list of 1 to `most` elements; `allowed` is for the message."""
     if not isinstance(value, list | tuple) or not 0 < len(value) <= most:
         reject(name, value, allowed)
     for i, element in enumerate(value):
@@ -189,7 +189,7 @@ def polynomial(name: str, value: Any) -> tuple[float, ...]:
 
 
 def one_of(name: str, value: Any, choices: Sequence[str | None]) -> Any:
-    """Return a text that is one of the choices. None can be a choice."""
+    """Return a value that is one of the choices, which are texts or None."""
     if not isinstance(value, str | None) or value not in choices:
         reject(name, value, " or ".join(map(repr, choices)))
     return value
@@ -199,7 +199,7 @@ reward = partial(one_of, choices=REWARDS)
 
 
 def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
-    """Return a set point: one of `SETPOINTS`, a constant, or one number per sample."""
+    """Return a set point: one of `SETPOINTS`, a constant, or a number for each sample, degC."""
     allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
     if isinstance(value, list | tuple):
         return numbers(name, value, allowed, math.inf)

@@ -1,4 +1,4 @@
-"""Draw a record of the loop with pygame: temperatures above, flows below, and its window."""
+"""Draw a record of an episode with pygame: temperatures above flows."""
 
 import math
 from collections.abc import Sequence
@@ -21,6 +21,9 @@ from mptc_gym.record import Record
 Colour = tuple[int, int, int]  # red, green and blue, 0 to 255
 
 SIZE = 960, 540  # of the picture: width and height, pixels
+# The panels: left edge, upper edge, width and height, in pixels from the upper left corner.
+TEMPERATURES = pygame.Rect(72, 44, 864, 214)
+FLOWS = pygame.Rect(72, 324, 864, 182)
 # The lines have the colours of Okabe and Ito, safe for colour-blind readers.
 TEMPERATURE = (0, 114, 178)
 SETPOINT = (213, 94, 0)
@@ -36,36 +39,28 @@ clock = pygame.time.Clock()  # limits the frame rate
 viewers: WeakSet[object] = WeakSet()  # environments that show pictures in the window
 
 
-class Place(NamedTuple):
-    """Where a panel lies in the picture, in pixels from its upper left corner."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-
 class Label(NamedTuple):
-    """A text in its colour, on a ground of another colour."""
+    """A text above a panel."""
 
     text: str
     colour: Colour
-    ground: Colour = _PAPER
-
-
-TEMPERATURES = Place(72, 44, 864, 214)
-FLOWS = Place(72, 324, 864, 182)
+    ground: Colour = _PAPER  # colour behind the text
 
 
 class Panel:
-    """A part of the picture with its own axes.
+    """A part of the picture, with axes.
 
-    `axis` holds the lower and the upper end of the vertical axis. The horizontal axis shows the
-    samples of the record, with numbers in minutes.
+    `place` is where the panel lies in the picture. `axis` holds the lower and the upper end of
+    the vertical axis. The horizontal axis shows the samples of the record, with numbers in
+    minutes.
     """
 
     def __init__(
-        self, surface: pygame.Surface, record: Record, place: Place, axis: tuple[float, float]
+        self,
+        surface: pygame.Surface,
+        record: Record,
+        place: pygame.Rect,
+        axis: tuple[float, float],
     ) -> None:
         self._surface = surface
         self._record = record
@@ -74,12 +69,15 @@ class Panel:
         self._font = pygame.font.Font(None, 22)
 
     def x(self, k: float) -> float:
-        """Return the horizontal position of sample k."""
+        """Return the horizontal position of sample k, pixels from the picture's left edge."""
         samples = k - self._record.first
         return self._place.left + samples * self._place.width / self._record.span
 
     def y(self, value: float) -> float:
-        """Return the vertical position of a value, at the panel's edge if it is beyond."""
+        """Return the vertical position of a value, pixels from the picture's upper edge.
+
+        A value beyond the vertical axis is drawn at the edge of the panel.
+        """
         low, high = self._axis
         below_top = (high - value) / (high - low) * self._place.height
         # 3 pixels inside the frame. By this order of min and max, NaN is at the lower edge.
@@ -87,24 +85,24 @@ class Panel:
 
     def grid(self) -> None:
         """Draw grid and frame, and write the numbers of both axes."""
-        left, top, width, height = self._place
-        bottom = top + height
+        place = self._place
         for value in ticks(*self._axis):
             self.level(_GRID, value)
-            self.write(f"{value:.6g}", _INK, midright=(left - 8, self.y(value)))
+            self.write(f"{value:.6g}", _INK, midright=(place.left - 8, self.y(value)))
         first = self._record.first
         samples_per_minute = 60.0 / self._record.sampling_interval
         last = first + self._record.span
         for minutes in ticks(first / samples_per_minute, last / samples_per_minute):
             x = self.x(minutes * samples_per_minute)
-            pygame.draw.line(self._surface, _GRID, (x, top), (x, bottom))
-            self.write(f"{minutes:.6g}", _INK, midtop=(x, bottom + 6))
-        # To the left of a number at the edge.
-        self.write("min", _INK, topright=(left - 34, bottom + 6))
-        pygame.draw.rect(self._surface, LIMIT, (left, top, width + 1, height + 1), 1)
+            pygame.draw.line(self._surface, _GRID, (x, place.top), (x, place.bottom))
+            self.write(f"{minutes:.6g}", _INK, midtop=(x, place.bottom + 6))
+        # The unit stands to the left of a number at the edge.
+        self.write("min", _INK, topright=(place.left - 34, place.bottom + 6))
+        frame_of_panel = place.left, place.top, place.width + 1, place.height + 1
+        pygame.draw.rect(self._surface, LIMIT, frame_of_panel, 1)
 
     def shade(self, colour: Colour, first: int, last: int, low: float, high: float) -> None:
-        """Shade the area between two samples and two values."""
+        """Shade the area from sample `first` to `last` and from the value `low` to `high`."""
         left = max(self._place.left, round(self.x(first)))
         right = round(self.x(last))
         top = round(self.y(high))
@@ -115,11 +113,14 @@ class Panel:
     def level(self, colour: Colour, value: float) -> None:
         """Draw a horizontal line across the panel."""
         y = self.y(value)
-        right = self._place.left + self._place.width
-        pygame.draw.line(self._surface, colour, (self._place.left, y), (right, y))
+        pygame.draw.line(self._surface, colour, (self._place.left, y), (self._place.right, y))
 
     def curve(self, colour: Colour, values: Sequence[float], width: int, *, held: bool) -> None:
-        """Draw the latest values, the newest last; if held, as steps from sample to sample."""
+        """Draw the values of the latest samples, the newest last, as a line.
+
+        `width` is that of the line, in pixels. With `held`, the line is a staircase: a value
+        holds until the next sample.
+        """
         first = self._record.k + 1 - len(values)
         points: list[tuple[float, float]] = []
         for k, value in enumerate(values, start=first):
@@ -134,8 +135,7 @@ class Panel:
 
     def heading(self, *labels: Label) -> None:
         """Write labels above the panel, from left to right."""
-        x = self._place.left
-        y = self._place.top - 16
+        x, y = self._place.left, self._place.top - 16
         for label in labels:
             box = self.write(f" {label.text} ", label.colour, label.ground, midleft=(x, y))
             x = box.right + 12
@@ -143,9 +143,10 @@ class Panel:
     def write(
         self, text: str, colour: Colour, ground: Colour = _PAPER, **anchor: tuple[float, float]
     ) -> pygame.Rect:
-        """Write a text and return its box.
+        """Write a text, and return the rectangle that it fills.
 
-        `anchor` is one position of the box by its name in pygame, as in `midleft=(x, y)`.
+        `anchor` is one position of the rectangle by its name in pygame, as in
+        `midleft=(x, y)`, in pixels.
         """
         image = self._font.render(text.replace("-", "\N{MINUS SIGN}"), True, colour, ground)
         ((name, (x, y)),) = anchor.items()
@@ -153,9 +154,9 @@ class Panel:
 
 
 def draw(record: Record) -> pygame.Surface:
-    """Return a picture."""
+    """Return a picture of a record, 960 by 540 pixels."""
     pygame.font.init()
-    # Three bytes per pixel, in the order of an array, so that converting it is just a copy.
+    # Three bytes per pixel, in the order of an array, so that making an array is just a copy.
     surface = pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
     surface.fill(_PAPER)
     _draw_temperatures(surface, record)
@@ -168,7 +169,8 @@ def _draw_temperatures(surface: pygame.Surface, record: Record) -> None:
     panel = Panel(surface, record, TEMPERATURES, record.temperature_axis)
     panel.grid()
     panel.curve(TEMPERATURE, [sample.output for sample in record.samples], 3, held=False)
-    # Above the temperature, and thinner, so that both can be seen where they agree.
+    # The set point lies above the temperature, and is thinner, so that both curves can be seen
+    # where both agree.
     panel.curve(SETPOINT, [sample.setpoint for sample in record.samples], 2, held=True)
     newest = record.samples[-1]
     minutes = record.k * record.sampling_interval / 60.0
@@ -192,8 +194,8 @@ def _draw_flows(surface: pygame.Surface, record: Record) -> None:
     panel.shade(IN_TRANSIT, record.k - int(plant.delay), record.k, lowest, highest)
     for limit in (plant.u_min, plant.u_max):
         panel.level(LIMIT, limit)
-    # A sample holds the flows of the step that led to it, so they begin one sample earlier. The
-    # flows of the oldest sample would begin before the picture.
+    # A sample holds the flows of the step that led to it, so these flows begin one sample
+    # earlier. The flows of the oldest sample would begin before the picture.
     applied = [sample.applied for sample in record.samples]
     commands = [sample.command for sample in record.samples]
     panel.curve(APPLIED, [*applied[1:], applied[-1]], 3, held=True)
@@ -207,7 +209,7 @@ def _draw_flows(surface: pygame.Surface, record: Record) -> None:
 
 
 def frame(record: Record) -> NDArray[np.uint8]:
-    """Return a picture, shape (540, 960, 3)."""
+    """Return a picture of a record as an array, shape (540, 960, 3): height, width, colours."""
     return np.array(pygame.surfarray.pixels3d(draw(record)).swapaxes(0, 1), order="C")
 
 
@@ -229,14 +231,17 @@ def show(record: Record, fps: float, viewer: object) -> None:
 
 
 def hide(viewer: object) -> None:
-    """Close the window, unless another environment shows its pictures in it."""
+    """Close the window, unless another environment shows pictures in the window."""
     viewers.discard(viewer)
     if not viewers:
         pygame.display.quit()
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return the multiples of 1, 2 or 5 times a power of ten in a range, 3 to 7 of them."""
+    """Return some 3 to 7 round numbers from `low` to `high`.
+
+    The numbers are multiples of 1, 2 or 5 times a power of ten.
+    """
     smallest_step = (high - low) / 6.0
     power = 10.0 ** math.floor(math.log10(smallest_step))
     step = next(

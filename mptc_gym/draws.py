@@ -1,4 +1,4 @@
-"""Draw the numbers of an episode: its streams of random numbers, and the plant numbers."""
+"""Draw plant numbers, and give every episode of a plant its own place in streams of draws."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mptc_gym.parameters import PLANT_NUMBERS, Parameters, PlantNumbers
 
 Values = NDArray[np.float64]  # one per plant, shape (n,), or one for all plants, shape ()
 
-DRAWS = 32  # random numbers that an episode reserves for plant numbers, also for future ones
+DRAWS = 32  # random numbers that an episode reserves for present and future plant numbers
 # The state of a PCG64 that has just been created, apart from its position in the stream.
 _PCG64 = {"bit_generator": "PCG64", "has_uint32": 0, "uinteger": 0}
 _ANY_SEED = np.random.SeedSequence(0)  # of generators whose state is set afterwards
@@ -26,21 +26,27 @@ class EpisodeStream:
     Episode j begins j * 2**64 draws into the stream, however many draws the episodes before it
     have used. So the j-th episode after a seed always gets the same draws.
 
-    The arguments are those of the `numpy.random.SeedSequence` that starts the stream. It is
-    created at the first episode, because many plants have streams that are never used.
+    The arguments are those of the `numpy.random.SeedSequence` that starts the stream. The
+    generator is created at the first episode, because many plants have streams that are never
+    used.
+
+    Attributes
+    ----------
+    generator : numpy.random.Generator
+        The generator of the present episode.
     """
 
     # Without a dict per stream, the streams of 100,000 plants take little memory.
     __slots__ = ("_episode", "_origin", "_seeds", "generator")
 
-    generator: np.random.Generator  # of the current episode
+    generator: np.random.Generator
 
     def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
         self._seeds = entropy, spawn_key, pool_size
         self._episode = 0
 
     def __deepcopy__(self, memo: dict[int, Any]) -> EpisodeStream:
-        """Return a copy at the same place; a plain deep copy takes ten times as long."""
+        """Return a copy at the same place in the stream, in a tenth of a plain copy's time."""
         duplicate = copy(self)
         if hasattr(self, "generator"):
             bits: Any = np.random.PCG64(_ANY_SEED)
@@ -56,7 +62,7 @@ class EpisodeStream:
             self.generator = np.random.Generator(np.random.PCG64(seeds))
             self._origin = self.generator.bit_generator.state["state"]
         else:
-            # Looked up every time, as a copied generator has a bit generator of its own.
+            # The bit generator is looked up every time, as a copied generator has another one.
             bits: Any = self.generator.bit_generator
             bits.state = {**_PCG64, "state": self._origin}
             bits.advance(self._episode << 64)
@@ -67,7 +73,7 @@ class EpisodeStream:
 class Streams(NamedTuple):
     """All streams of one plant.
 
-    New streams come last, so that the numbers of the others do not change.
+    A new stream would come last, so that the numbers of the present streams do not change.
     """
 
     noise: EpisodeStream
@@ -96,32 +102,26 @@ class Ranges:
     """Draw the plant numbers that are ranges, uniformly, with both ends of an integer's range.
 
     Every plant number has its own random number, whether it is a range or not. So the draws of
-    the others do not change if one more plant number becomes a range.
+    the other plant numbers do not change if one more becomes a range.
 
     Attributes
     ----------
-    names : dict
-        The plant numbers that are ranges, by name, with the ends (low, high).
     lowest : PlantNumbers
         All plant numbers, with the low end of a range, in arrays of shape ().
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        self.names = parameters.ranges
-        # The disturbance takes its random numbers from the same stream, after those of the
-        # plant numbers.
-        self._uses_stream = bool(self.names) or parameters.is_disturbed
-        lowest: dict[str, Values] = {}
-        for name in PLANT_NUMBERS:
-            low, _ = parameters.range_of(name)
-            lowest[name] = np.array(low)
+        self._ranges = parameters.ranges
+        # The disturbance takes random numbers from the same stream, after the random numbers of
+        # the plant numbers.
+        self._uses_stream = bool(self._ranges) or parameters.is_disturbed
+        lowest = {name: np.array(number) for name, number in vars(parameters.lowest).items()}
         self.lowest: PlantNumbers[Values] = PlantNumbers(**lowest)
 
     def draw(self, streams: Sequence[Streams]) -> PlantNumbers[Values]:
-        """Begin the next episode of some plants, and return its plant numbers.
+        """Begin the next episode of some plants with these streams, and return their numbers.
 
-        `streams` are those of the plants. Numbers that are ranges have the shape
-        (len(streams),), and the others the shape ().
+        Numbers that are ranges have the shape (len(streams),), and the others the shape ().
         """
         if not self._uses_stream:
             return self.lowest
@@ -129,7 +129,7 @@ class Ranges:
         for plant_streams, row in zip(streams, draws, strict=True):
             plant_streams.plant.next_episode().random(out=row)
         numbers: dict[str, NDArray[Any]] = {}
-        for name, (low, high) in self.names.items():
+        for name, (low, high) in self._ranges.items():
             share = draws[:, PLANT_NUMBERS[name]]  # from 0 to 1, 1 excluded
             if isinstance(low, int):
                 numbers[name] = low + np.floor(share * (high + 1 - low)).astype(int)
@@ -139,7 +139,10 @@ class Ranges:
 
 
 def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
-    """Return the numbers of plant i as Python numbers, given those of many plants."""
+    """Return the numbers of plant i as Python numbers, given the numbers of many plants.
+
+    Numbers that all plants share have the shape ().
+    """
     numbers_of_plant: dict[str, float] = {}
     for name, values in vars(numbers).items():
         value = values[i] if values.ndim else values

@@ -24,11 +24,9 @@ from mptc_gym.signals import ONE, Signals
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys of every info
 _FLOAT32 = np.dtype(np.float32)  # faster to pass than the type
-_METADATA = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
-
 NO_MODE = (
-    "render does nothing without a render mode: give one to gymnasium.make, as in "
-    'make("MiddlePoint-v0", render_mode="rgb_array")'
+    "render does nothing without a render mode: make the environment with a render mode, as in "
+    'gymnasium.make("MiddlePoint-v0", render_mode="rgb_array")'
 )
 Frame = NDArray[np.uint8]  # a picture, shape (540, 960, 3)
 Observation = NDArray[np.float32]
@@ -38,24 +36,24 @@ Action = NDArray[np.float32]
 def observation_space(parameters: Parameters) -> Space[Observation]:
     """Return the space of the observation, a `Box` of shape (size,), float32.
 
-    Its bounds depend on the set point only if it exceeds the transmitter's range, so that a
-    policy trained on one set point can run on another.
+    The bounds depend on the set point only if the set point exceeds the transmitter's range, so
+    that a policy trained on one set point can run on another.
     """
     span = parameters.temperature_span
     setpoint = parameters.setpoint
     if isinstance(setpoint, str):
         setpoint = parameters.setpoint_amplitude
     setpoint_limit = max(span, np.abs(setpoint).max())
-    # Of a set point, an error, an output and an action.
+    # The largest magnitude of a set point, of an error, of an output and of an action.
     limits = np.array([setpoint_limit, setpoint_limit + span, span, 1.0], np.float32)
     high = np.repeat(limits, parameters.windows)
     return Box(-high, high, dtype=np.float32)
 
 
 class HasPlainSpec:
-    """An environment whose spec holds lists and Python numbers in place of NumPy's.
+    """An environment whose spec can be written as JSON.
 
-    So the spec can be written as JSON.
+    The spec holds lists in place of arrays, and Python numbers in place of NumPy's.
     """
 
     _spec: EnvSpec | None = None
@@ -97,22 +95,24 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     the plant from sample k to k+1 and returns the observation at k+1 and the reward of e(k+1).
     So u(0) first shows in y(19).
 
-    Section 1 of the paper names further difficulties that (28) does not include. They are off
-    by default; some of `mptc_gym.PRESETS` turn them on:
+    Section 1 of the paper names further difficulties that (28) does not include. These
+    difficulties are off by default; some of `mptc_gym.PRESETS` turn them on:
 
     - Measurement noise: from k = 1 on, the observation shows y + v with white noise
-      v ~ N(0, measurement_noise_variance). Reward and `info["output"]` use the true y.
+      v ~ N(0, measurement_noise_variance). The reward and `info["output"]` use the true y.
     - A load disturbance w, as when the feedwater's temperature, the coal or the fire's position
       changes: A(1) w(k) is added to (28), so that a constant w adds w to y in the steady state.
-      It starts at 0 and changes every 10 samples. It is the sum of a random walk that gains a
-      variance of `disturbance_walk_variance` per sample, and of steps to levels uniform within
-      +-`disturbance_amplitude`, at random, every `disturbance_interval` samples on average.
+      The load starts at 0 and changes every 10 samples. The load is the sum of a random walk
+      that gains a variance of `disturbance_walk_variance` per sample, and of steps to levels
+      uniform within +-`disturbance_amplitude`, at random, every `disturbance_interval` samples
+      on average.
     - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times
       the dominant time constant. With p the slowest pole (0.9515), A = (1 - p z^-1) Q(z^-1),
       and the time constant is 1 / (1 - p) = 20.6 samples. For t times the time constant and g
       times the gain, 1 - p is divided by t, Q stays, and B is multiplied by g / t.
     - Fouling: in `drift_samples` samples, gain and time constant drift linearly to `gain_drift`
-      and `time_constant_drift` times their values at k = 0. They change every 10 samples.
+      and `time_constant_drift` times their values at k = 0. The drifting values change every 10
+      samples.
 
     ## Action space
 
@@ -126,8 +126,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
 
     ## Observation space
 
-    A 1-D float32 `Box` with the following blocks, each with the newest sample first. Here `y`
-    is the transmitter's reading, which saturates at +-`temperature_span`.
+    The observation space is a 1-D float32 `Box` with the following blocks, each with the newest
+    sample first. In the table, `y` is the transmitter's reading, which saturates at
+    +-`temperature_span`.
 
     | Block | Elements (default) | Bounds (default) | Unit |
     |---|---|---|---|
@@ -138,8 +139,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
 
     The defaults give the six inputs of the paper's neural network. Past actions are clipped to
     +-1, as the actuator limits them. With `action_window=delay+2` the noise-free problem is
-    Markov while the set point holds. If the set point can exceed the span, its bounds widen to
-    include it.
+    Markov while the set point holds. If the set point can exceed the transmitter's range, the
+    bounds of set points and errors widen to include the set point.
 
     ## Reward
 
@@ -158,60 +159,65 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     Before k = 0 the plant has been at rest: y, y_d, e, u, u_a and xi are all 0, so y(0) = 0.
     All randomness comes from the seed, in separate streams, so that every controller meets the
     same noise, set point, disturbance and plant. The j-th episode after a seed does not depend
-    on the length of the episodes before it. `reset` has no options.
+    on the length of earlier episodes. `reset` has no options.
 
     ## Episode end
 
-    Nothing terminates an episode. `gymnasium.make` truncates it after 1200 steps.
+    Nothing terminates an episode. `gymnasium.make` truncates an episode after 1200 steps.
 
     ## Arguments
 
-    All are keyword-only and can be given to `gymnasium.make`. An asterisk marks an argument
-    that can also be a range [low, high], from which each `reset` draws a number uniformly (an
-    integer where the default is one). They are declared in `mptc_gym/parameters.py`.
+    All arguments are keyword-only and can be given to `gymnasium.make`. An asterisk marks an
+    argument that can also be a range [low, high], from which each `reset` draws a number
+    uniformly (an integer where the default is an integer). The arguments are declared in
+    `mptc_gym/parameters.py`.
 
     <arguments>
 
     `render_mode` is None, "human" or "rgb_array"; see Rendering. Lists may also be tuples or
-    NumPy arrays. Numbers are within +-1e9, the delay and each window at most 10,000
+    NumPy arrays. Numbers are within +-1e9, the delay and each window are at most 10,000
     samples, and `a`, `b` and `c` have at most 1,000 coefficients each.
 
     ## Info
 
     `reset` and `step` return a new dict of floats: `output` (the true y, degC), `setpoint`
     (y_d, degC), `error` (y_d - y, degC), `command` (u, t/h), `applied` (u_a, t/h) and `noise`
-    (n, degC). After a step, `command` and `applied` belong to the step, the others to the
-    sample it leads to. At reset, `command`, `applied` and `noise` are 0.
+    (n, degC). After a step, `command` and `applied` belong to the step, and the other values
+    belong to the sample to which the step leads. At reset, `command`, `applied` and `noise` are
+    0.
 
-    With a load disturbance there is also `disturbance` (w, degC), and with a drift the current
-    `gain_factor` and `time_constant_factor`. The dict of `reset` also holds each number that
-    was drawn, under its name; a delay is an int.
+    With a load disturbance, the dict also holds `disturbance` (w, degC), and with a drift, the
+    present `gain_factor` and `time_constant_factor`. The dict of `reset` also holds each number
+    that was drawn, under its name; a delay is an int.
 
     ## Rendering
 
     | `render_mode` | `render` |
     |---|---|
     | "rgb_array" | returns a picture, shape (540, 960, 3), uint8 |
-    | "human" | shows it in a window, as do `reset` and `step`, at most `metadata["render_fps"]` times a second |
+    | "human" | shows the picture in a window, as do `reset` and `step`, at most `metadata["render_fps"]` times a second |
 
-    Both show the last 200 samples, or more if the delay is long: set point and true
+    A picture shows the last 200 samples, or more if the delay is long: set point and true
     temperature; commanded and applied flow, with the dead zone, the limits and the time in
-    which the flow is still in transit to the middle point. Both need pygame:
+    which the flow is still in transit to the middle point. Pictures need pygame:
     `pip install "mptc_gym[render]"`. Gymnasium's `RecordVideo` also needs moviepy.
 
     ## Errors
 
     For an invalid argument or `render_mode`, the constructor raises a `ValueError` that names
-    it; for a misspelt argument, a `TypeError`. If an action is not one finite number, `step`
-    raises a `ValueError` and leaves the plant unchanged. Without pygame, the first picture
-    raises `DependencyNotInstalled`.
+    the argument. For a misspelt argument, the constructor raises a `TypeError`. If an action is
+    not one finite number, `step` raises a `ValueError` and leaves the plant unchanged. Without
+    pygame, the first picture raises `DependencyNotInstalled`.
 
     ## Version history
 
     * v0: first version.
     """  # noqa: E501 (the tables)
 
-    metadata: dict[str, Any] = _METADATA
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as in gymnasium.Env)
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 30,
+    }
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         parameters = Parameters.of_environment(arguments)
@@ -224,34 +230,40 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         # `step` unpacks two tuples, which is faster than reading as many attributes.
         quadratic = parameters.reward == "quadratic"
         self._reward_terms = parameters.error_scale, quadratic, parameters.move_weight
-        # The places where errors, outputs and actions begin in the observation, and its size.
+        # The places where errors, outputs and actions begin in the observation, and the size of
+        # the observation.
         places = np.cumsum(parameters.windows).tolist()
         self._layout = parameters.temperature_span, *places
+        self._has_more_info = parameters.is_disturbed or parameters.drifts
         self._ranges = Ranges(parameters)
         self._signals = Signals.of(parameters)
-        self._is_disturbed = parameters.is_disturbed
-        self._drifts = parameters.drifts
-        self._has_more_info = self._is_disturbed or self._drifts
         self._streams: list[Streams] = []  # of the only plant; empty before the first reset
         self._root: np.random.Generator | None = None  # from which the streams were spawned
-        # y_d, n, w and the measurement noise of the samples ahead, the next one last.
+        # y_d, n, w and the measurement noise of the samples to come, the next sample last.
         self._ahead: list[tuple[float, ...]] = []
 
-    # `Parameters` alone lists the arguments; help() and editors see them spelt out here.
+    # Only `Parameters` lists the arguments; this signature shows them in help() and in editors.
     __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, float]]:
-        """Bring the plant to rest, start an episode, and return observation and info at k = 0.
+        """Bring the plant to rest and start an episode.
 
         Parameters
         ----------
         seed
-            Restarts the environment's random streams. Without it, the next episode of the
-            current streams begins.
+            Restarts the environment's random streams. Without a seed, the next episode of the
+            present streams begins.
         options
             Not used.
+
+        Returns
+        -------
+        observation : ndarray of float32
+            The observation at k = 0, shape (size,).
+        info : dict
+            The info at k = 0.
         """
         super().reset(seed=seed)
         if self._root is not self.np_random:
@@ -270,7 +282,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         _, error_place, output_place, action_place, size = self._layout
         # `step` needs one more element at the end.
         self._window = [0.0] * action_place + [rest_action] * (size - action_place + 1)
-        # An empty block begins where the next one does, which is written after it.
+        # An empty block begins where the next block does, which is written later.
         self._window[0] = setpoint
         self._window[error_place] = setpoint
         self._window[output_place] = 0.0
@@ -282,9 +294,10 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         info = dict.fromkeys(INFO, 0.0)
         info["setpoint"] = setpoint
         info["error"] = setpoint
-        if self._has_more_info:
-            self._add_more_info(info, 0.0)
-        info |= numbers.chosen(self._ranges.names)
+        if self.parameters.is_disturbed:
+            info["disturbance"] = 0.0
+        info |= self._plant.factors
+        info |= numbers.chosen(self.parameters.ranges)
         return np.fromiter(self._window, _FLOAT32, size), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
@@ -313,9 +326,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         ResetNeeded
             Before the first reset.
         """
-        # This is the hot path: code that runs in every step avoids function calls.
+        # The speed of the environment depends on this method, so it avoids function calls.
         try:
-            a = float(action.item() - 0.0)  # text is not a number, even if float() parses it
+            a = float(action.item() - 0.0)  # the difference fails for text such as "0.3"
         except (AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
             a = one_action(action)
         observed_action = a
@@ -343,9 +356,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         if not -span <= measured <= span:
             measured = _limited(measured, span)
         # One insertion shifts all blocks by one place. The oldest element of a block moves to
-        # the first place of the next block, where it is overwritten. An empty block begins
-        # where the next one does, which is written after it; an empty last block begins at the
-        # additional element at the end.
+        # the first place of the next block, where the new sample overwrites it. An empty block
+        # begins where the next block does, which is written later; an empty last block begins
+        # at the additional element at the end.
         window = self._window
         window.insert(0, setpoint)
         window.pop()
@@ -362,7 +375,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             "noise": noise,
         }
         if self._has_more_info:
-            self._add_more_info(info, load)
+            if self.parameters.is_disturbed:
+                info["disturbance"] = load
+            info |= self._plant.factors
         if self._record is not None:
             self._record.add(setpoint, output, command, applied)
             if self.render_mode == "human":
@@ -370,7 +385,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         return observation, reward, False, False, info
 
     def render(self) -> Frame | None:
-        """Draw the last minutes of the episode.
+        """Draw the last samples of the episode.
 
         Returns
         -------
@@ -399,24 +414,17 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         return None
 
     def close(self) -> None:
-        """Close the window, unless another environment shows its pictures in it."""
+        """Close the window, unless another environment shows its pictures in this window."""
         if self.render_mode == "human" and self._record is not None:
             from mptc_gym import drawing  # which needs pygame
 
             drawing.hide(self)
         self._record = None
 
-    def _add_more_info(self, info: dict[str, float], load: float) -> None:
-        """Add the load and the factors of gain and time constant, if they can change."""
-        if self._is_disturbed:
-            info["disturbance"] = load
-        if self._drifts:
-            info["gain_factor"], info["time_constant_factor"] = self._plant.factors
-
 
 MiddlePointEnv.__doc__ = insert_table(MiddlePointEnv.__doc__)
 
 
 def _limited(value: float, limit: float) -> float:
-    """Return a value within +-limit; by this order of min and max, NaN becomes the limit."""
+    """Limit a value to +-limit; by this order of min and max, NaN becomes the limit."""
     return max(-limit, min(limit, value))

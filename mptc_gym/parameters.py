@@ -8,7 +8,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -21,7 +21,7 @@ _LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
 
 class Argument(NamedTuple):
-    """Declaration of an argument of the environment, apart from its name and type."""
+    """Declaration of an argument of the environment, without the argument's name and type."""
 
     default: Any
     check: checks.Check  # returns a valid value in plain Python types, or raises a ValueError
@@ -40,11 +40,12 @@ def _arg(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
 class PlantNumbers(Generic[Value]):
     """The numbers of a plant that can differ from episode to episode.
 
-    As arguments they are of type `Number`: a number, or a range from which each reset draws.
-    During an episode they are floats for one plant, and arrays for many plants.
+    As arguments, the numbers are of type `Number`: a number, or a range from which each reset
+    draws.
+    During an episode, the numbers are floats for one plant, and arrays for many plants.
 
     Field i takes the i-th random number of a reset. So the order of the fields never changes,
-    and new fields come last: otherwise a seed would stand for another plant.
+    and a new field comes last: otherwise a seed would stand for another plant.
     """
 
     delay: Value = _arg(18, checks.samples, "samples", "transport delay d of (28)")
@@ -82,7 +83,7 @@ class PlantNumbers(Generic[Value]):
     )
 
     def chosen(self, names: Iterable[str]) -> dict[str, Value]:
-        """Return the numbers of these names."""
+        """Return the plant numbers with these names, by name."""
         return {name: getattr(self, name) for name in names}
 
 
@@ -105,7 +106,7 @@ class Parameters(PlantNumbers[Number]):
     Raises
     ------
     ValueError
-        If an argument is out of range. The message names the argument, its value and what is
+        If an argument is out of range. The message names the argument, the value and what is
         allowed.
     """
 
@@ -124,7 +125,7 @@ class Parameters(PlantNumbers[Number]):
         1200, checks.duration, "samples", "duration of the drifts of gain and time constant"
     )
     sampling_interval: float = _arg(8.0, checks.positive, "s", "scale of the time axis only")
-    # The paper plots the set point without stating its values.
+    # The paper plots the set point, but does not state the values.
     setpoint: str | float | Sequence[float] = _arg(
         "square",
         checks.setpoint,
@@ -145,7 +146,7 @@ class Parameters(PlantNumbers[Number]):
         'P: "square" repeats every P samples; "random" holds a level for P/6 to P/2 samples, '
         "uniformly",
     )
-    # The observation. By default it is the six inputs of the paper's network: y_d(k), y_d(k-1),
+    # The default observation is the six inputs of the paper's network: y_d(k), y_d(k-1),
     # y_d(k-2), e(k), e(k-1), e(k-2).
     setpoint_window: int = _arg(
         3, checks.samples, "samples", "number of latest set points observed"
@@ -191,7 +192,7 @@ class Parameters(PlantNumbers[Number]):
         is_stable = abs(slowest_pole(self.a)) < 1.0
         if self.is_disturbed and not is_stable:
             load_values = tuple(self.chosen(_LOAD_ARGUMENTS).values())
-            allowed = "0 for this a, which is not stable and has no steady state"
+            allowed = "0 for this a: the plant is not stable, so it has no steady state"
             reject(", ".join(_LOAD_ARGUMENTS), load_values, allowed)
         if not any(self.windows):
             names = "setpoint_window, error_window, output_window, action_window"
@@ -214,20 +215,21 @@ class Parameters(PlantNumbers[Number]):
             if name not in ARGUMENTS:
                 similar = difflib.get_close_matches(name, [*ARGUMENTS, "render_mode"], n=1)
                 hint = f": did you mean {similar[0]!r}?" if similar else ""
-                # These are Python's words, by which callers detect an unsupported argument.
+                # The message begins as Python's own message does, which some callers look for.
                 raise TypeError(
                     f"MiddlePoint-v0 got an unexpected keyword argument {name!r}{hint}"
                 )
         return cls(**arguments)
 
     def _check_actuator(self) -> None:
-        """Refuse limits and dead zones that do not fit together in every episode."""
+        """Refuse ranges of limits and dead zones from which a draw would not fit together."""
         lowest_u_min, highest_u_min = self.range_of("u_min")
         lowest_u_max, highest_u_max = self.range_of("u_max")
         if highest_u_min >= lowest_u_max:
             reject("u_min", self.u_min, f"below u_max = {self.u_max}")
-        # The largest magnitude of a command, max(|u_min|, |u_max|), where the draws make it
-        # smallest. Over a range [low, high], the smallest magnitude is max(low, -high, 0).
+        # The reach is the largest magnitude of a command, max(|u_min|, |u_max|), for the draws
+        # that make this magnitude smallest. Over a range [low, high], the smallest magnitude is
+        # max(low, -high, 0).
         reach = max(lowest_u_min, -highest_u_min, lowest_u_max, -highest_u_max, 0.0)
         _, largest_dead_zone = self.range_of("dead_zone")
         if largest_dead_zone > reach:
@@ -235,19 +237,18 @@ class Parameters(PlantNumbers[Number]):
             reject("dead_zone", self.dead_zone, f"{allowed} = {reach:g}")
 
     def _check_time_constant(self) -> None:
-        """Refuse a changed time constant if A has none, or if its pole would fall below 0."""
+        """Refuse another time constant if A has none, or where the pole would be below 0."""
+        names = "time_constant_factor", "time_constant_drift"
         pole = slowest_pole(self.a)
         rate = 1.0 - pole.real  # 1 / time constant, per sample
-        lowest_factor, _ = self.range_of("time_constant_factor")
-        lowest_drift, _ = self.range_of("time_constant_drift")
+        (lowest_factor, _), (lowest_drift, _) = map(self.range_of, names)
+        allowed = ""
         if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
             allowed = f"1 for this a, whose slowest pole is {pole:g}, not one between 0 and 1"
         elif lowest_factor * min(lowest_drift, 1.0) < rate:
-            allowed = f"such that the factor is never below {rate:g}, where that pole is 0"
-        else:
-            return
-        names = "time_constant_factor", "time_constant_drift"
-        reject(", ".join(names), tuple(self.chosen(names).values()), allowed)
+            allowed = f"such that the factor is never below {rate:g}, where the pole is 0"
+        if allowed:
+            reject(", ".join(names), tuple(self.chosen(names).values()), allowed)
 
     def range_of(self, name: str) -> tuple[float, float]:
         """Return the lowest and the highest value that a plant number can take."""
@@ -257,37 +258,42 @@ class Parameters(PlantNumbers[Number]):
             return low, high
         return value, value
 
-    @property
+    @cached_property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest value of the plant numbers that are drawn at each reset."""
+        """The ends (low, high) of the plant numbers that each reset draws, by name."""
         numbers = self.chosen(PLANT_NUMBERS)
         return {name: value for name, value in numbers.items() if isinstance(value, tuple)}
 
-    @property
+    @cached_property
+    def lowest(self) -> PlantNumbers[float]:
+        """All plant numbers, with the low end in place of a range."""
+        return PlantNumbers(**{name: self.range_of(name)[0] for name in PLANT_NUMBERS})
+
+    @cached_property
     def is_disturbed(self) -> bool:
         """Whether there is a load disturbance."""
         return self._can_differ(0.0, *_LOAD_ARGUMENTS)
 
     def _can_differ(self, value: float, *names: str) -> bool:
-        """Return whether any of these plant numbers differs from `value`, or may."""
+        """Return whether any of these plant numbers can have another value than `value`."""
         return any(self.range_of(name) != (value, value) for name in names)
 
-    @property
+    @cached_property
     def drifts(self) -> bool:
         """Whether the dynamics change within an episode."""
         return self._can_differ(1.0, "gain_drift", "time_constant_drift")
 
-    @property
+    @cached_property
     def changes_time_constant(self) -> bool:
         """Whether the time constant can differ from that of A, at the start or by drift."""
         return self._can_differ(1.0, "time_constant_factor", "time_constant_drift")
 
-    @property
+    @cached_property
     def changes_dynamics(self) -> bool:
         """Whether A and B of (28) can change, at the start or by drift."""
         return self.drifts or self._can_differ(1.0, "gain_factor", "time_constant_factor")
 
-    @property
+    @cached_property
     def windows(self) -> tuple[int, int, int, int]:
         """Sizes of the observation's blocks: set points, errors, outputs, actions."""
         return self.setpoint_window, self.error_window, self.output_window, self.action_window
@@ -313,11 +319,12 @@ def argument_table() -> str:
     return "\n".join(rows)
 
 
-def insert_table(docstring: str | None) -> str | None:
-    """Return a docstring with the table of arguments in place of `<arguments>`."""
-    if docstring is None:  # under `python -OO`
-        return None
-    return inspect.cleandoc(docstring).replace("<arguments>", argument_table())
+def insert_table(docstring: str | None) -> str:
+    """Return a docstring with the table of arguments in place of `<arguments>`.
+
+    `python -OO` removes docstrings: then `docstring` is None, and the result is empty.
+    """
+    return inspect.cleandoc(docstring or "").replace("<arguments>", argument_table())
 
 
 Parameters.__doc__ = insert_table(Parameters.__doc__)
@@ -326,7 +333,7 @@ Parameters.__doc__ = insert_table(Parameters.__doc__)
 def spelt_out(function: Callable[..., Any]) -> inspect.Signature:
     """Return the signature of a constructor, for help() and editors.
 
-    All arguments of the environment take the place of `**arguments`.
+    In this signature, all arguments of the environment take the place of `**arguments`.
     """
     _, *parameters, _ = inspect.signature(function).parameters.values()  # not self, **arguments
     for parameter in inspect.signature(Parameters).parameters.values():

@@ -10,11 +10,11 @@ from mptc_gym.parameters import PlantNumbers
 
 SPAN = 200  # fewest samples that a picture spans
 LONGEST = 2000  # most samples that a picture spans, even with a long delay
-FARTHEST = 1e12  # degC; temperatures beyond it, and NaN, are drawn at the edge
+FARTHEST = 1e12  # degC; temperatures beyond this value, and NaN, are drawn at the edge
 
 
 class Sample(NamedTuple):
-    """The signals of one sample."""
+    """The signals of sample k, after the step from sample k-1."""
 
     setpoint: float  # y_d(k), degC
     output: float  # y(k), degC

@@ -1,11 +1,11 @@
 """Generate the external signals of an episode: set point, noise and load disturbance.
 
-Every signal has the same methods. `reset` begins an episode of some plants at k = 0. `next`
-returns the next sample of all plants. `ahead` returns the next `BLOCK` samples of the only
-plant, and is used in place of `next`.
+Every signal has three methods. `reset` begins an episode of some plants at k = 0. `next`
+returns the next sample of all plants. `ahead` takes the place of `next` where there is one
+plant only, and returns the next `BLOCK` samples of this plant.
 
 Noise and disturbance are generated a block of samples at a time: drawing many numbers in one
-call is much faster than drawing them one by one, and gives the same numbers.
+call is much faster than drawing the numbers one by one, and gives the same numbers.
 """
 
 from __future__ import annotations
@@ -21,17 +21,16 @@ from numpy.typing import NDArray
 from mptc_gym.draws import EpisodeStream, Streams
 from mptc_gym.parameters import Parameters, PlantNumbers
 
-Values = NDArray[
-    np.float64
-]  # one per plant; plant numbers that all plants share are of shape ()
+# One number per plant, shape (n,); a plant number that all plants share has the shape ().
+Values = NDArray[np.float64]
 Indices = NDArray[np.intp]  # of some plants, sorted
 StreamsOfPlants = Mapping[int, Streams] | Sequence[Streams]  # by the index of the plant
 
 BLOCK = 600  # samples of a signal generated together
-FOREVER = 1 << 62  # samples
-PLANTS_AT_A_TIME = 32  # few enough that their draws stay in the processor's cache
+FOREVER = 1 << 62  # samples: longer than any episode
+PLANTS_AT_A_TIME = 32  # so few that the draws of these plants stay in the processor's cache
 LOAD_INTERVAL = 10  # samples between changes of the load disturbance
-LEVELS_AT_A_TIME = 60  # of the load disturbance, generated together
+LEVELS_AT_A_TIME = BLOCK // LOAD_INTERVAL  # of the load disturbance, generated together
 ONE = np.zeros(1, np.intp)  # the indices of one plant
 
 
@@ -46,10 +45,11 @@ def colours(parameters: Parameters) -> dict[str, Sequence[float]]:
 
 
 class Noise:
-    """One of the noises, 0 at k = 0: C(z^-1) xi(k) of (28), or the measurement noise.
+    """One of the noises of many plants, 0 at k = 0.
 
-    `name` is "noise" or "measurement_noise", and `c` are the coefficients of C. The values of
-    `block` samples are generated at a time.
+    The noise is C(z^-1) xi(k) of (28) if `name` is "noise", and the transmitter's noise if
+    `name` is "measurement_noise". `c` are the coefficients of C. The values of `block` samples
+    are generated at a time.
     """
 
     def __init__(self, name: str, c: Sequence[float], num_envs: int, block: int) -> None:
@@ -57,7 +57,7 @@ class Noise:
         self._c = np.array(c)[:, np.newaxis, np.newaxis]
         # C times the standard deviation of xi, shape (length of C, num_envs, 1).
         self._scaled_c = np.zeros((len(c), num_envs, 1))
-        # The latest xi of each plant, the oldest first, as multiples of the deviation.
+        # The latest xi of each plant, the oldest first, as multiples of the standard deviation.
         self._past = np.zeros((num_envs, len(c) - 1))
         # One row per sample, so that the values that all plants need at once are contiguous.
         self._block = np.zeros((block, num_envs))
@@ -66,7 +66,7 @@ class Noise:
     def reset(
         self, which: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
     ) -> None:
-        """Begin an episode of some plants."""
+        """Begin an episode of some plants, whose numbers are `numbers`."""
         deviations = np.sqrt(getattr(numbers, f"{self._name}_variance"))
         self._scaled_c[:, which] = deviations[..., np.newaxis] * self._c
         self._past[which] = 0.0
@@ -88,7 +88,7 @@ class Noise:
         return row
 
     def ahead(self) -> list[float]:
-        """Return the next block of one plant, degC."""
+        """Return the next block of the only plant, degC."""
         self._fill(ONE, 0)
         noise: list[float] = self._block[:, 0].tolist()
         return noise
@@ -115,7 +115,7 @@ class Noise:
 
 
 class Levels:
-    """The levels of a set point, and for how many samples each of them is held.
+    """The levels of a set point, and for how many samples a level is held.
 
     Attributes
     ----------
@@ -123,7 +123,8 @@ class Levels:
         Whether levels are drawn: uniformly within +-`amplitude`, degC, and held for a number of
         samples from `shortest` to `longest`, both included.
     values, lengths : list
-        Otherwise: the levels, degC, which are repeated, and the samples for which they hold.
+        The levels, degC, and for how many samples a level holds; after the last level, the
+        first level follows again. Of no use if levels are drawn.
     """
 
     values: list[float]
@@ -147,10 +148,10 @@ class Levels:
             self.lengths = [1] * (len(self.values) - 1) + [FOREVER]
 
     def next(self, place: int, stream: EpisodeStream) -> tuple[float, int]:
-        """Return a level, degC, and for how many samples it holds.
+        """Return a level, degC, and for how many samples the level holds.
 
-        It is drawn from the stream if levels are random. Otherwise it is level number `place`
-        of the episode, counted from 0.
+        If levels are random, the level is drawn from the stream. Otherwise, the level is number
+        `place` of the episode, counted from 0.
         """
         if self.random:
             level = stream.generator.uniform(-self.amplitude, self.amplitude)
@@ -161,42 +162,42 @@ class Levels:
 
 
 class _HeldValues(ABC):
-    """Values of many plants, each held until the time at which it is due to change.
+    """Values of many plants; each value is held until the time of its next change.
 
     Times are counted in samples since the plants were created.
+
+    Attributes
+    ----------
+    present : ndarray of float64
+        The present values of all plants, degC, shape (num_envs,); only to be read.
     """
 
     def __init__(self, num_envs: int) -> None:
+        self.present = np.zeros(num_envs)
         self._clock = 0  # the present time
-        self._current = np.zeros(num_envs)  # the values at this time, degC
         self._due = np.zeros(num_envs, np.int64)  # the time of each plant's next change
         self._earliest_due = 0
-
-    @property
-    def present(self) -> Values:
-        """The present values of all plants, degC, shape (num_envs,); only to be read."""
-        return self._current
 
     def next(self) -> Values:
         """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
         self._clock += 1
         if self._clock >= self._earliest_due:
             self._make_due_changes()
-        return self._current
+        return self.present
 
     def _make_due_changes(self) -> None:
-        # A value may be held for 0 samples, as with a period of 1: then it changes once more.
+        # A level may hold for 0 samples, as with a period of 1: then the value changes again.
         while self._clock >= self._earliest_due:
             self._change(self._due <= self._clock)
             self._earliest_due = int(self._due.min())
 
     @abstractmethod
     def _change(self, is_due: NDArray[np.bool_]) -> None:
-        """Change the values that are due, and set the times of their next changes."""
+        """Change the values that are due, and set the times of the next changes."""
 
 
 class SetPoint(_HeldValues):
-    """The set point y_d(k)."""
+    """The set point y_d(k) of many plants."""
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         super().__init__(num_envs)
@@ -206,45 +207,45 @@ class SetPoint(_HeldValues):
         self._places = np.zeros(num_envs, np.intp)  # of each plant's next level
 
     def reset(self, which: Indices, streams: StreamsOfPlants) -> Values:
-        """Begin an episode of some plants, and return y_d(0), shape (len(which),)."""
+        """Begin an episode of some plants, and return y_d(0), degC, shape (len(which),)."""
         self._streams = streams
         if self._levels.random:
             for i in which.tolist():
                 streams[i].setpoint.next_episode()
+        # The first level begins now.
         self._places[which] = 0
-        # Their first levels begin now.
         self._due[which] = self._clock
         self._earliest_due = self._clock
         self._make_due_changes()
-        return self._current[which]
+        return self.present[which]
 
     def ahead(self) -> list[float]:
-        """Return the next block of one plant, degC."""
-        level = self._current.item()
+        """Return the next block of the only plant, degC."""
+        level = self.present.item()
         place = self._places.item()
+        remaining = self._earliest_due - self._clock - 1  # samples with the present level
         values: list[float] = []
-        samples_to_change = self._earliest_due - self._clock - 1  # from the start of the block
-        while samples_to_change < BLOCK:
-            values += [level] * (samples_to_change - len(values))
-            level, length = self._levels.next(place, self._streams[0].setpoint)
+        while len(values) + remaining < BLOCK:
+            values += [level] * remaining
+            level, remaining = self._levels.next(place, self._streams[0].setpoint)
             place += 1
-            samples_to_change += length
+        remaining -= BLOCK - len(values)
         values += [level] * (BLOCK - len(values))
-        self._current[0] = level
+        self.present[0] = level
         self._places[0] = place
         self._clock += BLOCK
-        self._earliest_due = self._clock + 1 + samples_to_change - BLOCK
+        self._earliest_due = self._clock + 1 + remaining
         return values
 
     def _change(self, is_due: NDArray[np.bool_]) -> None:
         which = np.flatnonzero(is_due)
         if self._levels.random:
             for i in which.tolist():
-                self._current[i], length = self._levels.next(0, self._streams[i].setpoint)
+                self.present[i], length = self._levels.next(0, self._streams[i].setpoint)
                 self._due[i] += length
         else:
             places = self._places[which]
-            self._current[which] = self._level_values[places]
+            self.present[which] = self._level_values[places]
             self._due[which] += self._level_lengths[places]
             self._places[which] = (places + 1) % len(self._level_values)
 
@@ -252,29 +253,32 @@ class SetPoint(_HeldValues):
 class Disturbance(_HeldValues):
     """The load disturbance w(k): the sum of steps and a random walk, both starting at 0.
 
-    It changes every `LOAD_INTERVAL` samples. The walk takes a uniform step of the required
-    variance; the sum of many is close to normal. With a probability of
-    `LOAD_INTERVAL / disturbance_interval` the other part jumps to a new level, uniform within
+    The load changes every `LOAD_INTERVAL` samples. The walk then takes a uniform step of the
+    required variance; the sum of many such steps is close to normal. With a probability of
+    `LOAD_INTERVAL / disturbance_interval`, the other part jumps to a new level, uniform within
     +-`disturbance_amplitude`.
     """
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
         self._amplitudes = np.zeros(num_envs)  # of the steps, degC
-        self._probabilities = np.zeros(num_envs)  # of a step to a new level at a change
+        self._probabilities = np.zeros(num_envs)  # of a jump to a new level at a change
         self._widths = np.zeros(num_envs)  # half widths of the steps of the walk, degC
         # Steps and walk at the latest change that has been generated, degC.
         self._last_steps = np.zeros(num_envs)
         self._last_walk = np.zeros(num_envs)
         self._levels = np.zeros((num_envs, LEVELS_AT_A_TIME))  # generated ahead, degC
-        # Indices in the flattened levels: the end of each plant's row, and its next level.
+        # Indices in the flattened levels: the end of each plant's row, and the next level.
         self._ends = np.arange(1, num_envs + 1) * LEVELS_AT_A_TIME
         self._places = self._ends.copy()
 
     def reset(
         self, which: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
     ) -> None:
-        """Begin an episode of some plants, whose numbers have been drawn before."""
+        """Begin an episode of some plants, whose numbers are `numbers`.
+
+        The numbers have been drawn from the plant's stream, which the disturbance continues.
+        """
         self._streams = streams
         self._amplitudes[which] = numbers.disturbance_amplitude
         self._probabilities[which] = LOAD_INTERVAL / numbers.disturbance_interval
@@ -282,26 +286,25 @@ class Disturbance(_HeldValues):
         self._widths[which] = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
         self._last_steps[which] = 0.0
         self._last_walk[which] = 0.0
-        self._current[which] = 0.0
+        self.present[which] = 0.0
         self._places[which] = self._ends[which]
         self._due[which] = self._clock + LOAD_INTERVAL
         self._earliest_due = int(self._due.min())
-        self._ahead = [0.0] * (LOAD_INTERVAL - 1)  # samples of the only plant; see `ahead`
+        # Samples of the only plant before the next levels; see `ahead`.
+        self._ahead = [0.0] * (LOAD_INTERVAL - 1)
 
     def ahead(self) -> list[float]:
-        """Return the next block of one plant, degC."""
-        while len(self._ahead) < BLOCK:
-            self._refill(ONE)
-            self._ahead += np.repeat(self._levels[0], LOAD_INTERVAL).tolist()
-        block = self._ahead[:BLOCK]
-        self._ahead = self._ahead[BLOCK:]
-        return block
+        """Return the next block of the only plant, degC."""
+        self._refill(ONE)
+        samples = [*self._ahead, *np.repeat(self._levels[0], LOAD_INTERVAL).tolist()]
+        self._ahead = samples[BLOCK:]
+        return samples[:BLOCK]
 
     def _change(self, is_due: NDArray[np.bool_]) -> None:
         is_empty = self._places == self._ends
         self._refill(np.flatnonzero(is_due & is_empty))
         next_levels = self._levels.take(self._places, mode="clip")
-        np.copyto(self._current, next_levels, where=is_due)
+        np.copyto(self.present, next_levels, where=is_due)
         self._places += is_due
         self._due += LOAD_INTERVAL * is_due
 
@@ -329,7 +332,7 @@ class Disturbance(_HeldValues):
         new_levels = (2.0 * level_draws - 1.0) * self._amplitudes[plants, np.newaxis]
         candidates = np.hstack((self._last_steps[plants, np.newaxis], new_levels))
         # The level at a change is the candidate of the latest jump; the first candidate is the
-        # level before.
+        # level before these changes.
         jumps = jump_draws < self._probabilities[plants, np.newaxis]
         jump_indices = np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0)
         latest_jumps = np.maximum.accumulate(jump_indices, axis=1)
@@ -351,7 +354,10 @@ class Signals(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Parameters, num_envs: int = 1, block: int = BLOCK) -> Signals:
-        """Return the signals of an environment; `block` samples of noise are made at a time."""
+        """Return the signals of plants with these parameters.
+
+        `block` samples of noise are generated at a time.
+        """
         noises: dict[str, Noise] = {}
         for name, c in colours(parameters).items():
             noises[name] = Noise(name, c, num_envs, block)
@@ -365,14 +371,20 @@ class Signals(NamedTuple):
     def reset(
         self, which: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
     ) -> Values:
-        """Begin an episode of some plants, and return y_d(0); the other signals start at 0."""
+        """Begin an episode of some plants, and return y_d(0), degC, shape (len(which),).
+
+        Noise, disturbance and measurement noise are 0 at k = 0.
+        """
         for signal in (self.noise, self.disturbance, self.measurement_noise):
             if signal is not None:
                 signal.reset(which, streams, numbers)
         return self.setpoint.reset(which, streams)
 
     def ahead(self) -> list[tuple[float, ...]]:
-        """Return y_d, n, w and the measurement noise of one plant, one tuple per sample."""
+        """Return the next `BLOCK` samples of the only plant.
+
+        A sample is a tuple of y_d, n, w and the measurement noise, degC.
+        """
         columns: list[list[float]] = []
         for signal in self:
             if signal is None:

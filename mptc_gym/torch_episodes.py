@@ -1,7 +1,12 @@
-"""Keep the episodes of many plants in PyTorch: times, plant numbers, values from outside."""
+"""Keep the episodes of many plants in PyTorch: times, plant numbers, values from outside.
 
-from collections.abc import Mapping
-from typing import Any
+The environment computes blocks of samples ahead. Times are counted in steps of the environment.
+A reset of some plants may come before the environment has returned all samples of a block. Then
+the unused samples at the end of the block are dropped, and computed anew for all plants.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mptc_gym.checks import reject
-from mptc_gym.parameters import PLANT_NUMBERS, Parameters
+from mptc_gym.parameters import Parameters
 from mptc_gym.plant import DRIFT_INTERVAL
 
 LONGEST = 64  # most samples in a block
@@ -18,18 +23,67 @@ Number = float | Tensor  # one for all plants, or one per plant, shape (n,)
 
 
 def as_tensor(values: Any, like: Tensor) -> Tensor | None:
-    """Return numbers as a tensor of the type and device of `like`, or None if they are not."""
+    """Return numbers in a tensor with the type and device of `like`; None for other values."""
     try:
         return torch.as_tensor(values, dtype=like.dtype, device=like.device)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         return None
 
 
-class Episodes:
-    """The current episodes of n plants: their starts and plant numbers, and the clock.
+class Block(NamedTuple):
+    """A block of samples that are computed at once: the samples stand in rows."""
 
-    The environment computes blocks of samples ahead. A reset may come before all of a block has
-    been used.
+    first_time: int  # of row 0
+    samples: int
+    starts: Tensor | int  # time at k = 0 of each plant, shape (n,), or one time for all plants
+    due_rows: list[int]  # rows at which the load and the drifts of some plant are due to change
+
+    def age(self, row: int) -> Tensor | int:
+        """Return the k of a row, shape (n,), or one number for all plants."""
+        return self.first_time + row - self.starts
+
+    def ages(self, device: torch.device) -> Tensor:
+        """Return the k of all rows, shape (samples, n), or (samples, 1) for all plants."""
+        return torch.arange(self.samples, device=device)[:, None] + self.age(0)
+
+
+class History:
+    """The latest values of a quantity of n plants: one tensor of shape (n,) for each sample.
+
+    Attributes
+    ----------
+    rows : list of Tensor
+        The values, the oldest first: the values of the `length` samples before the latest
+        block, then the values of the block.
+    """
+
+    def __init__(self, zeros: Tensor, length: int) -> None:
+        self.rows = [zeros] * length
+        self._length = length
+
+    def extend(self, block: Sequence[Tensor]) -> None:
+        """Add the values of a block, and forget values that are no longer needed."""
+        self.rows = [*self.rows[len(self.rows) - self._length :], *block]
+
+    def reset(self, mask: Tensor, rows_to_drop: int, newest: Tensor | None = None) -> None:
+        """Begin an episode of the plants in a mask, shape (n,), with zeros before k = 0.
+
+        `rows_to_drop` is the number of samples to drop at the end. `newest` are the values at
+        k = 0, shape (n,); None stands for zeros.
+        """
+        end = len(self.rows) - rows_to_drop
+        rows = self.rows[end - self._length : end]
+        self.rows = [row.masked_fill(mask, 0.0) for row in rows]
+        if self.rows and newest is not None:
+            self.rows[-1] = torch.where(mask, newest, self.rows[-1])
+
+    def detach(self) -> None:
+        """Cut the graph that leads to earlier actions."""
+        self.rows = [row.detach() for row in self.rows]
+
+
+class Episodes:
+    """The present episodes of n plants: when the episodes began, and the plant numbers.
 
     Attributes
     ----------
@@ -39,21 +93,14 @@ class Episodes:
         The source of all random numbers.
     numbers : dict
         The plant numbers by name, floats or tensors of shape (n,).
-    clock : int
-        Set by the environment: before `next` of a signal, the time of the first sample of the
-        block; before `reset`, the time at which the new episodes begin. Times are counted in
-        steps of the environment.
-    unused : int
-        Set by the environment before `reset`: how many samples at the end of the latest block
-        have not been used. They lie beyond the clock, and signals drop them.
+    starts : Tensor or int
+        The time at which each plant's episode began, shape (n,), or one time for all plants.
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
         self.zeros = zeros
         self.generator = torch.Generator(zeros.device)
         self.generator.seed()  # from the operating system, until `reset` gets a seed
-        self.clock = 0
-        self.unused = 0
         self._ranges = parameters.ranges
         tensor_names = set(self._ranges)
         # If one limit is drawn, both are tensors: PyTorch clamps either between two numbers or
@@ -62,20 +109,20 @@ class Episodes:
         if limits & tensor_names:
             tensor_names |= limits
         self.numbers: dict[str, Number] = {}
-        for name in PLANT_NUMBERS:
-            lowest = float(parameters.range_of(name)[0])
-            self.numbers[name] = zeros + lowest if name in tensor_names else lowest
-        # The time at the start of each plant's episode, shape (n,), or one time for all plants.
-        self._starts: Tensor | int = 0
+        for name, lowest in vars(parameters.lowest).items():
+            self.numbers[name] = zeros + lowest if name in tensor_names else float(lowest)
+        self.starts: Tensor | int = 0
         # Load and drifting dynamics change when the age of an episode is a multiple of
-        # `DRIFT_INTERVAL`. These are the remainders of the clock at which this happens to a
-        # plant. They are known on the host, so that nothing has to wait for the device.
-        self._has_changes = parameters.drifts or parameters.is_disturbed
+        # `DRIFT_INTERVAL`: when the time, divided by `DRIFT_INTERVAL`, leaves one of these
+        # remainders. The remainders are on the host, so that nothing waits for the device.
         self._due_remainders: set[int] = set()
-        self._rows = torch.arange(LONGEST, device=zeros.device)[:, None]
 
     def reset(
-        self, mask: Tensor, starts: NDArray[np.int64], given: Mapping[str, "Given"]
+        self,
+        mask: Tensor,
+        time: int,
+        starts: NDArray[np.int64],
+        external: Mapping[str, "External"],
     ) -> dict[str, Tensor]:
         """Begin an episode of some plants, and return the plant numbers that are ranges.
 
@@ -83,105 +130,104 @@ class Episodes:
         ----------
         mask
             The plants, shape (n,).
+        time
+            The present time.
         starts
-            The time at the start of each plant's present episode, shape (n,): `clock` for the
+            The time at which each plant's present episode began, shape (n,): `time` for the
             plants in the mask.
-        given
-            Plant numbers that are not drawn, by name.
+        external
+            The plant numbers that are not drawn, by name.
 
         Returns
         -------
         dict of Tensor
-            The numbers by name, shape (n,); only those of plants in the mask are of use.
+            The numbers by name, shape (n,); only the numbers of plants in the mask are of use.
         """
         numbers: dict[str, Tensor] = {}
         for name, (low, high) in self._ranges.items():
             is_integer = isinstance(low, int)
-            if name in given:
-                values = given[name].reset(mask)
+            if name in external:
+                values = external[name].reset(mask)
             else:
                 values = self.draw(low, high, is_integer)
             self.numbers[name] = torch.where(mask, values, self.numbers[name])
             numbers[name] = values.to(torch.int64) if is_integer else values
-        if (starts == self.clock).all():
-            self._starts = self.clock
+        if (starts == time).all():
+            self.starts = time
         else:
-            previous_starts = torch.zeros_like(mask, dtype=torch.int64) + self._starts
-            self._starts = previous_starts.masked_fill(mask, self.clock)
-        if self._has_changes:
-            self._due_remainders = set(np.unique(starts % DRIFT_INTERVAL).tolist())
+            previous_starts = torch.zeros_like(mask, dtype=torch.int64) + self.starts
+            self.starts = previous_starts.masked_fill(mask, time)
+        self._due_remainders = set(np.unique(starts % DRIFT_INTERVAL).tolist())
         return numbers
 
-    def age(self, row: int) -> Tensor | int:
-        """Return k at a row of the block, shape (n,), or one number for all plants."""
-        return self.clock + row - self._starts
-
-    def ages(self, samples: int) -> Tensor:
-        """Return k at each sample of the block, shape (samples, n), or (samples, 1)."""
-        return self._rows[:samples] + self.age(0)
-
-    def any_due(self, row: int) -> bool:
-        """Return whether the age of some plant at a row is a multiple of `DRIFT_INTERVAL`."""
-        return (self.clock + row) % DRIFT_INTERVAL in self._due_remainders
+    def block(self, first_time: int, samples: int) -> Block:
+        """Return the block of this number of samples from this time on."""
+        due_rows = [
+            row
+            for row in range(samples)
+            if (first_time + row) % DRIFT_INTERVAL in self._due_remainders
+        ]
+        return Block(first_time, samples, self.starts, due_rows)
 
     def draw_within_one(self, rows: int) -> Tensor:
         """Draw numbers uniformly from -1 to 1, 1 excluded, shape (rows, n)."""
         numbers = self.zeros.new_empty(rows, len(self.zeros))
         return numbers.uniform_(-1.0, 1.0, generator=self.generator)
 
-    def draw(self, low: float, high: float, whole: bool) -> Tensor:
-        """Draw numbers uniformly from a range, both ends included, shape (n,).
+    def draw(self, low: float, high: float, is_integer: bool) -> Tensor:
+        """Draw numbers, or integers, uniformly from `low` to `high`, both included.
 
-        `whole` asks for whole numbers.
+        The result has the shape (n,) and the floating-point type of `zeros`.
         """
         numbers = torch.empty_like(self.zeros)
-        numbers.uniform_(low, high + whole, generator=self.generator)
-        if whole:
+        numbers.uniform_(low, high + is_integer, generator=self.generator)
+        if is_integer:
             numbers = numbers.floor()
         return numbers.clamp(max=high)
 
 
-class Given:
+class External:
     """A signal, or a plant number, that is read from a tensor instead of drawn.
 
-    The values have the shape (episodes, samples, n). After the last episode, the first follows
-    again; after the last sample, its value is held. Of a plant number, there is one sample, and
-    `reset` returns it.
+    The tensor has the shape (episodes, samples, n). After the last episode, the first episode
+    follows again; the value of the last sample of an episode is held. A plant number has
+    one sample, which `reset` returns.
+
+    Attributes
+    ----------
+    last_sample : int
+        The last k of an episode that has a value.
     """
 
-    def __init__(self, values: Tensor, episodes: Episodes) -> None:
+    def __init__(self, values: Tensor) -> None:
         self._values = values
-        self._episodes = episodes
         # The index of each plant's present episode, shape (n,).
-        self._episode = torch.full_like(episodes.zeros, -1, dtype=torch.int64)
+        self._episode = torch.full_like(values[0, 0], -1, dtype=torch.int64)
+        self.last_sample = values.shape[1] - 1
 
-    def reset(self, mask: Tensor) -> Tensor:
-        """Begin the next episode of some plants."""
+    def reset(self, mask: Tensor, rows_to_drop: int = 0) -> Tensor:
+        """Begin the next episode of some plants, and return the values at k = 0."""
         self._episode = self._episode + mask
         return self._at(torch.zeros_like(self._episode)[None])[0]
 
-    def next(self, samples: int) -> Tensor:
-        """Return the next samples."""
-        return self._at(self._episodes.ages(samples))
+    def next(self, block: Block) -> Tensor:
+        """Return the values of a block."""
+        return self._at(block.ages(self._values.device))
 
     def _at(self, ages: Tensor) -> Tensor:
-        """Return the values at these ages of the present episodes, shape (samples, n)."""
+        """Return the values at some ages of the present episodes, shape (samples, n).
+
+        The ages, in samples, have the shape (samples, n) or (samples, 1).
+        """
         episodes, samples, _ = self._values.shape
         rows = self._episode % episodes * samples + ages.clamp(max=samples - 1)
         return self._values.flatten(0, 1).gather(0, rows)
 
 
-def read_signals(
-    signals: Any, parameters: Parameters, episodes: Episodes
-) -> tuple[dict[str, Given], int | None]:
-    """Check `options["signals"]` of a reset.
+def read_signals(signals: Any, parameters: Parameters, zeros: Tensor) -> dict[str, External]:
+    """Check `options["signals"]` of a reset; return the signals and plant numbers by name.
 
-    Returns
-    -------
-    dict of Given
-        The signals and plant numbers by name; empty if `signals` is None.
-    int or None
-        The last sample of an episode that all signals have; None without signals.
+    `zeros` have the type and device to use, and the shape (n,). None stands for no signals.
 
     Raises
     ------
@@ -189,7 +235,7 @@ def read_signals(
         If a name is unknown, or a value has the wrong shape, is not finite or out of range.
     """
     if signals is None:
-        return {}, None
+        return {}
     names = {*SIGNALS, *parameters.ranges}
     if not parameters.is_disturbed:
         names.remove("disturbance")
@@ -198,51 +244,44 @@ def read_signals(
         reject("options['signals']", signals, allowed)
     if not signals or not names >= {*signals}:
         reject("options['signals']", [*signals], allowed)
-    checked: dict[str, Given] = {}
-    last_sample: int | None = None
+    checked: dict[str, External] = {}
     for name, value in signals.items():
+        ends = parameters.ranges.get(name)
         path = f"options['signals'][{name!r}]"
-        if name in parameters.ranges:
-            values = _read_values(path, value, 1, episodes.zeros)
-            _check_range(path, value, values, parameters.ranges[name])
-            checked[name] = Given(values[:, None], episodes)
-        else:
-            values = _read_values(path, value, 2, episodes.zeros)
-            checked[name] = Given(values, episodes)
-            last_of_signal = values.shape[1] - 1
-            if last_sample is None or last_of_signal < last_sample:
-                last_sample = last_of_signal
-    return checked, last_sample
+        checked[name] = External(_read_values(path, value, ends, zeros))
+    return checked
 
 
-def _read_values(path: str, value: Any, dimensions: int, zeros: Tensor) -> Tensor:
-    """Return a value as a tensor, checked, with a leading axis for episodes.
+def _read_values(
+    path: str, value: Any, ends: tuple[float, float] | None, zeros: Tensor
+) -> Tensor:
+    """Return the values of a signal or a plant number, shape (episodes, samples, n).
 
-    `dimensions` is 1 for plant numbers, shape (n,), and 2 for signals, shape (samples, n), each
-    apart from the axis for episodes, which the value may lack.
+    `ends` are the lowest and the highest value of a plant number; None stands for a signal. A
+    ValueError that names `path` is raised for values that are not allowed.
     """
     n = len(zeros)
+    shape = f"(samples, {n})" if ends is None else f"({n},)"
     values = as_tensor(value, zeros)
     if values is None:
         reject(path, value, "numbers")
-    if values.ndim == dimensions:
-        values = values[None]
-    if values.ndim != dimensions + 1 or values.shape[-1] != n or not values.numel():
-        shape = f"({n},)" if dimensions == 1 else f"(samples, {n})"
+    shape_of_values = tuple(values.shape)
+    if ends is not None and values.ndim:
+        values = values.unsqueeze(-2)  # the only sample
+    if values.ndim == 2:
+        values = values[None]  # the only episode
+    if values.ndim != 3 or values.shape[-1] != n or not values.numel():
         raise ValueError(
-            f"{path} must have the shape {shape}, or one more dimension before, of "
-            f"episodes, got {tuple(values.shape)}"
+            f"{path} must have the shape {shape}, or one more dimension before it, of "
+            f"episodes, got {shape_of_values}"
         )
     if not values.isfinite().all():
         raise ValueError(f"{path} must be finite")
+    if ends is not None:
+        low, high = values.new_tensor(ends)
+        fits = (low <= values) & (values <= high)
+        if isinstance(ends[0], int):
+            fits &= values == values.round()
+        if not fits.all():
+            reject(path, value, f"within the range of this argument, {list(ends)}")
     return values
-
-
-def _check_range(path: str, value: Any, values: Tensor, ends: tuple[float, float]) -> None:
-    """Refuse plant numbers outside their range, or fractions where it is one of integers."""
-    low, high = values.new_tensor(ends)
-    fits = bool(((low <= values) & (values <= high)).all())
-    if isinstance(ends[0], int):
-        fits = fits and bool((values == values.round()).all())
-    if not fits:
-        reject(path, value, f"within its range, {list(ends)}")

@@ -1,11 +1,10 @@
 """Move many plants in PyTorch by (28) and (29), a block of samples at a time.
 
-`PlantBatch` in `mptc_gym.plant` does so in NumPy, a sample at a time.
+`PlantBatch` in `mptc_gym.plant` moves many plants in NumPy, a sample at a time.
 """
 
 from collections import deque
 from itertools import islice, pairwise
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,20 +12,21 @@ from torch.nn import functional
 
 from mptc_gym.parameters import Parameters, PlantNumbers
 from mptc_gym.plant import DRIFT_INTERVAL, Dynamics, least_effective
-from mptc_gym.torch_episodes import Episodes, Number
+from mptc_gym.torch_episodes import Block, Episodes, History, Number
 
 
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
-    """Return the flow u_a that the actuator applies, (29), t/h.
+    """Return the flow u_a that the actuator applies, (29), t/h, shape (n,).
 
-    Its gradient is 1 within the limits, also in the dead zone, and 0 beyond. Commands of a
-    magnitude above `edge` have an effect. The limits are both floats, or both of shape (n,).
+    A command, t/h, of a magnitude above `edge` passes the dead zone. The limits are both
+    floats, or both of shape (n,). The gradient of the flow is 1 within the limits, also in the
+    dead zone, and 0 beyond the limits.
     """
     are_floats = (
         isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
     )
     if are_floats and not command.requires_grad and u_min <= 0.0 <= u_max:
-        # The fastest way to the same numbers.
+        # These two operations are the fastest way to the same numbers.
         shrunk = functional.hardshrink(command, edge)  # type: ignore[arg-type]  # it is a float
         return shrunk.clamp_(u_min, u_max)  # type: ignore[arg-type]
     limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
@@ -40,13 +40,13 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
 
 
 class TorchPlants:
-    """Many plants side by side, with gradients where the actions have them.
+    """Many plants side by side, with gradients where the actions have gradients.
 
     Attributes
     ----------
     most_samples : int
-        d + 1, with d the shortest delay that can be drawn: so many outputs after an action
-        follow from the actions so far, and can be computed in one block.
+        The longest block: d + 1 samples, with d the shortest delay that can be drawn. The
+        outputs of the d + 1 samples after an action follow from the actions so far.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
@@ -59,35 +59,38 @@ class TorchPlants:
         self._beta = tuple(parameters.b)
         shortest, self._longest = map(int, parameters.range_of("delay"))
         self.most_samples = shortest + 1
-        self._order = len(parameters.a) - 1  # of A
-        # The flows that terms of B still need, the oldest first.
+        # The flows that terms of B still need, t/h, the oldest first.
         flows = self._longest + len(self._beta)
         self._flows = deque([self._zeros] * flows, flows)
-        # The outputs that A needs from before the latest block, then those of the block.
-        self._outputs = [self._zeros] * self._order
+        # The outputs, degC. A needs as many outputs as A has coefficients from z^-1 on.
+        self._outputs = History(self._zeros, len(parameters.a) - 1)
 
-    def reset(self, mask: Tensor) -> None:
-        """Bring some plants to rest, with the numbers of the current episodes."""
-        used_outputs = self._outputs[: len(self._outputs) - self._episodes.unused]
-        self._outputs = [output.masked_fill(mask, 0.0) for output in used_outputs]
+    def reset(self, mask: Tensor, age: Tensor | int, rows_to_drop: int) -> None:
+        """Bring some plants to rest, with the numbers of the present episodes.
+
+        Parameters
+        ----------
+        mask
+            The plants, shape (n,).
+        age
+            The k of all plants, shape (n,), or one number for all; 0 for plants in the mask.
+        rows_to_drop
+            How many samples at the end of the latest block are dropped.
+        """
+        self._outputs.reset(mask, rows_to_drop)
         self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
-        self._reset_dynamics()
         self._reset_actuator()
         self._reset_delays()
-
-    def _reset_dynamics(self) -> None:
-        """Compute the factors of gain and time constant at k = 0, and their drifts."""
         numbers = PlantNumbers(**self._episodes.numbers)
-        self._factors = self._dynamics.factors(numbers, 0)
+        self._initial_factors = self._dynamics.factors(numbers, 0)
         if self._drifts:
-            # The factors at the start of the drifts, and their total change.
+            # The factors at the start of the drifts, and the total change of the factors.
             final_factors = self._dynamics.factors(numbers, self._drift_samples)
             self._drift = [
                 (self._zeros + initial, self._zeros + (final - initial))
-                for initial, final in zip(self._factors, final_factors, strict=True)
+                for initial, final in zip(self._initial_factors, final_factors, strict=True)
             ]
-        # The present factors and coefficients of (28), if they are known.
-        self._present: tuple[Any, Any] | None = None
+        self._update_dynamics(age)
 
     def _reset_actuator(self) -> None:
         """Compute what `apply` needs of the actuator's numbers."""
@@ -111,6 +114,19 @@ class TorchPlants:
             first_rows = self._longest - delay.to(torch.int64)
             self._places = (rows[:, None] + first_rows) * n + columns
 
+    def _update_dynamics(self, age: Tensor | int) -> None:
+        """Compute gain and time constant at an age, samples, and the coefficients of (28)."""
+        self._factors: tuple[Number, ...] = self._initial_factors
+        if self._drifts:
+            if isinstance(age, Tensor):
+                age = age.to(self._zeros.dtype)
+            share = self._dynamics.share(age - age % DRIFT_INTERVAL)
+            self._factors = tuple(
+                _add_product(initial, share, change) for initial, change in self._drift
+            )
+        coefficients = self._dynamics.coefficients(*self._factors)
+        self._alpha, self._scale, self._load_gain = coefficients
+
     def apply(self, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Apply a(k) of all plants, shape (n,), and return u(k) and u_a(k), t/h."""
         u_min, u_max = self._limits
@@ -124,16 +140,16 @@ class TorchPlants:
         return command, applied
 
     def outputs(
-        self, samples: int, noise: Tensor | None, load: Tensor | None
-    ) -> tuple[Tensor, list[tuple[Number, Number]]]:
-        """Compute the outputs of the next samples, after the action before them was applied.
+        self, block: Block, noise: Tensor | None, load: Tensor | None
+    ) -> tuple[Tensor, list[tuple[Number, ...]]]:
+        """Compute the outputs of a block, after the action before the block was applied.
 
         Parameters
         ----------
-        samples
-            Length of the block, at most `most_samples`.
+        block
+            The block, of at most `most_samples` samples.
         noise, load
-            n and w, degC, shape (samples, n); None if they are always 0.
+            n and w, degC, shape (samples, n); None for a signal that is always 0.
 
         Returns
         -------
@@ -142,38 +158,34 @@ class TorchPlants:
         list of tuple
             Gain and time constant at each sample, as multiples of those of A and B.
         """
-        outputs = self._outputs[len(self._outputs) - self._order :]
-        all_factors: list[tuple[Number, Number]] = []
-        response = self._response(samples)
+        outputs = [*self._outputs.rows]
+        factors: list[tuple[Number, ...]] = []
+        response = self._response(block.samples)
         # The coefficients are constant from each of these rows to the next.
-        boundaries = [row for row in range(samples) if row == 0 or self._has_drifted(row)]
-        for first, end in pairwise([*boundaries, samples]):
-            if self._present is None or self._has_drifted(first):
-                self._present = self._dynamics_at(first)
-            factors, (alpha, scale, load_gain) = self._present
-            all_factors += [factors] * (end - first)
+        changes = block.due_rows if self._drifts else []
+        for first, end in pairwise(sorted({0, *changes, block.samples})):
+            if first in changes:
+                self._update_dynamics(block.age(first))
+            factors += [self._factors] * (end - first)
             forced = response[first:end]
             if noise is not None:
-                forced = _add_product(noise[first:end], scale, forced)
+                forced = _add_product(noise[first:end], self._scale, forced)
             elif self._changes_dynamics:
-                forced = forced * scale
+                forced = forced * self._scale
             if load is not None:
-                forced = _add_product(forced, load_gain, load[first:end])
+                forced = _add_product(forced, self._load_gain, load[first:end])
             for forced_row in forced.unbind():
                 output = forced_row
-                for lag, coefficient in enumerate(alpha, start=1):
+                for lag, coefficient in enumerate(self._alpha, start=1):
                     output = _add_product(output, coefficient, outputs[-lag])
                 outputs.append(output)
-        self._outputs = outputs
-        return torch.stack(outputs[self._order :]), all_factors
-
-    def _has_drifted(self, row: int) -> bool:
-        """Return whether the dynamics of some plant change at a row of the block."""
-        return self._drifts and self._episodes.any_due(row)
+        new_outputs = outputs[-block.samples :]
+        self._outputs.extend(new_outputs)
+        return torch.stack(new_outputs), factors
 
     def detach(self) -> None:
         """Cut the graph that leads to earlier actions."""
-        self._outputs = [output.detach() for output in self._outputs]
+        self._outputs.detach()
         self._flows.extend([flow.detach() for flow in self._flows])
 
     def _response(self, samples: int) -> Tensor:
@@ -191,19 +203,6 @@ class TorchPlants:
             earlier = flows[needed - samples - lag : needed - lag]
             response = response.add_(earlier, alpha=coefficient)
         return response
-
-    def _dynamics_at(self, row: int) -> tuple[Any, Any]:
-        """Return gain and time constant at a row, and the coefficients of (28) for them."""
-        factors: tuple[Any, ...] = self._factors
-        if self._drifts:
-            age = self._episodes.age(row)
-            if isinstance(age, Tensor):
-                age = age.to(self._zeros.dtype)
-            share = self._dynamics.share(age - age % DRIFT_INTERVAL)
-            factors = tuple(
-                _add_product(initial, share, change) for initial, change in self._drift
-            )
-        return factors, self._dynamics.coefficients(*factors)
 
 
 def _add_product(first: Tensor, factor: Number, second: Tensor) -> Tensor:

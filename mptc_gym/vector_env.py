@@ -31,9 +31,9 @@ STEPS_PER_SHIFT = 64  # steps after which the window of observations is moved ba
 class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects the bases
     """n plants that advance together: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
 
-    Given the same seed, `reset` and `step` return bit for bit what Gymnasium's `SyncVectorEnv`
-    of n `MiddlePointEnv` returns. See `MiddlePointEnv` for the plant, the spaces, the reward,
-    the infos and the arguments.
+    Given the same seed, `reset` and `step` return bit for bit the same as Gymnasium's
+    `SyncVectorEnv` of n `MiddlePointEnv`. See `MiddlePointEnv` for the plant, the spaces, the
+    reward, the infos and the arguments.
 
     Parameters
     ----------
@@ -43,20 +43,20 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         Samples after which an episode is truncated; None or -1 for no limit.
     autoreset_mode
         An `AutoresetMode` or its value. "NextStep": the step after the end of an episode resets
-        the plant, and its action is ignored. "SameStep": the step that ends an episode resets
-        the plant, and its infos hold the last observation and info of the episode as
-        `final_obs` and `final_info`.
-        "Disabled": the caller resets ended plants with `reset(options={"reset_mask": mask})`.
+        the plant, and the action of this step is ignored. "SameStep": the step that ends an
+        episode resets the plant, and the infos of this step hold the last observation and info
+        of the episode as `final_obs` and `final_info`. "Disabled": the caller resets plants
+        whose episode has ended, with `reset(options={"reset_mask": mask})`.
     render_mode
         None, or "rgb_array": `render` returns a picture of each plant.
     **arguments
-        The arguments of `MiddlePointEnv`. They are the same for all plants, but where one is a
-        range, every plant draws a number of its own.
+        The arguments of `MiddlePointEnv`. All plants have the same arguments, but where an
+        argument is a range, every plant draws its own number.
 
     Raises
     ------
     ValueError
-        If an argument is out of range; the message names it.
+        If an argument is out of range; the message names the argument.
     TypeError
         If an argument is unknown.
 
@@ -64,12 +64,12 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     -----
     `reset(seed=seed)` restarts the random streams of plant i with seed + i, or with element i
     if the seed is a list. Without a seed, or where the list holds None, the next episode of the
-    current streams begins. Rewards are float64, and observations float32.
+    present streams begins. Rewards are float64, and observations float32.
 
     All plants share one clock, so that a step is array arithmetic alone. There is a Python loop
-    over plants only where each draws from its own generators: at the start of an episode, once
-    every 600 samples or so of noise, and when a random set point changes. A plant needs the
-    same few KiB however long an episode lasts.
+    over plants only where every plant draws from its own generators: at the start of an
+    episode, once every 600 samples or so of noise, and when a random set point changes. The
+    memory that a plant needs, a few KiB, does not grow with the length of an episode.
 
     With an unstable `a`, or with actions beyond 1e154, y may overflow. NumPy then warns here,
     while `MiddlePointEnv` continues without a warning.
@@ -91,19 +91,21 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
         parameters = self.parameters
         self.render_mode = render_mode
-        self._records: dict[int, Record] = {}  # of every plant, for pictures
+        # Streams and, for pictures, records by the index of the plant, from the first reset on.
+        self._streams: dict[int, Streams] = {}
+        self._records: dict[int, Record] = {}
         self._seeds: list[int | None] = [None] * num_envs
-        self._streams: dict[int, Streams] = {}  # of every plant, from the first reset on
         self._ranges = Ranges(parameters)
-        # Blocks of noise that end with an episode; shorter ones, which are slower, where many
-        # plants would need much memory.
+        # Blocks of noise end with an episode. Where many plants would need much memory, the
+        # blocks are shorter, which is slower.
         longest = max(1, min(BLOCK, NOISE_BYTES // (8 * num_envs)))
         block = math.ceil(self._limit / math.ceil(self._limit / longest))
         self._signals = Signals.of(parameters, num_envs, block)
         self._plants = PlantBatch(parameters, num_envs)
-        self._shown = _Window(parameters.windows, num_envs)
+        self._window = _Window(parameters.windows, num_envs)
         self._actions = np.zeros(num_envs)  # of the last step
-        # Arrays instead of numbers, for speed, as in `PlantBatch`.
+        # In comparisons, an array of full length is faster than a number; in other arithmetic,
+        # an array of one number is faster.
         self._zeros = np.zeros(num_envs)
         self._all_true = np.ones(num_envs, np.bool_)
         self._all_false = np.zeros(num_envs, np.bool_)
@@ -117,7 +119,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """The seed of each plant; None before the first reset."""
+        """The seed of each plant; None for each plant before the first reset."""
         return tuple(self._seeds)
 
     def render(self) -> tuple[Frame, ...] | None:
@@ -135,7 +137,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return tuple(map(drawing.frame, self._records.values()))
 
     def _advance(self, a: Values) -> tuple[Observations, Values, Mask, Mask, Infos]:
-        # This is the hot path: for few plants, the number of calls determines its speed.
+        # The speed of the environment depends on this method: for few plants, on its number of
+        # calls.
         signals = self._signals
         setpoint = signals.setpoint.next()
         noise = self._zeros
@@ -169,7 +172,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             measured = np.fmin(measured, highest)  # which turns NaN into the limit
             np.fmax(measured, lowest, out=measured)
             measured_error = setpoint - measured
-        observations = self._shown.add(setpoint, measured_error, measured, a)
+        observations = self._window.add(setpoint, measured_error, measured, a)
         if self._records:
             columns = (values.tolist() for values in (setpoint, output, command, applied))
             for i, sample in enumerate(zip(*columns, strict=True)):
@@ -193,10 +196,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         if load is not None:
             infos["disturbance"] = load.copy()
             infos["_disturbance"] = mask
-        if self._factor_names:
-            for name, factors in zip(self._factor_names, self._plants.factors, strict=True):
-                infos[name] = factors.copy()
-                infos[f"_{name}"] = mask
+        for name, factors in self._plants.factors.items():
+            infos[name] = factors.copy()
+            infos[f"_{name}"] = mask
         return observations, rewards, self._all_false.copy(), self._all_false.copy(), infos
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
@@ -206,18 +208,16 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         setpoint = self._signals.reset(which, self._streams, numbers)
         rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         self._actions[which] = rest_action
-        self._shown.reset(which, setpoint, rest_action)
+        self._window.reset(which, setpoint, rest_action)
         if self.render_mode is not None:
             interval = self.parameters.sampling_interval
             for place, i in enumerate(which.tolist()):
                 numbers_of_plant = plant_numbers(numbers, place)
                 self._records[i] = Record(numbers_of_plant, interval, setpoint[place].item())
 
-        infos: dict[str, NDArray[Any]] = {}
-        if self._factor_names:
-            infos.update(zip(self._factor_names, self._plants.factors, strict=True))
+        infos: dict[str, NDArray[Any]] = {**self._plants.factors}
         infos_of_which = {"setpoint": setpoint, "error": setpoint}
-        infos_of_which |= numbers.chosen(self._ranges.names)
+        infos_of_which |= numbers.chosen(self.parameters.ranges)
         for name, values in infos_of_which.items():
             infos[name] = np.zeros(self.num_envs, values.dtype)
             infos[name][which] = values
@@ -229,15 +229,14 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             final_observations[i] = observations[i].copy()
         return final_observations
 
-    def _flags(self, mask: Mask) -> Mask:
-        return mask.copy()
+    def _as_array(self, values: NDArray[Any]) -> NDArray[Any]:
+        return values.copy()
 
-    def _from_host(self, values: NDArray[Any]) -> NDArray[Any]:
-        return values
-
-    def _present_load(self) -> Values:
-        disturbance = self._signals.disturbance
-        return self._zeros if disturbance is None else disturbance.present
+    def _hidden_state(self) -> tuple[dict[str, Values], Values]:
+        load = self._zeros
+        if self._signals.disturbance is not None:
+            load = self._signals.disturbance.present
+        return self._plants.numbers.chosen(self.parameters.ranges), load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         seeds = self._checked_seeds(seed)
@@ -250,7 +249,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
                 self._streams[i] = Streams.of_seed(int(seed_of_plant))
 
     def _checked_seeds(self, seed: Any) -> Sequence[Any]:
-        """Return a seed for each plant, or None for plants whose streams continue."""
+        """Return the seed of each plant, which is None for plants whose streams continue."""
         n = self.num_envs
         if seed is None:
             return [None] * n
@@ -259,7 +258,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         seeds = plain(seed)
         is_list = isinstance(seeds, list | tuple) and len(seeds) == n
         if not is_list or not all(element is None or is_count(element) for element in seeds):
-            allowed = f"an integer of at least 0, or a list of {n} of them or None"
+            allowed = f"None, an integer of at least 0, or a list of {n} such values"
             reject("seed", seed, allowed)
         return list(seeds)
 
@@ -271,9 +270,10 @@ class _Window:
     """The observations of all plants.
 
     An observation has four blocks: set points, errors, outputs and actions, each with the
-    newest first. The observations lie one after another in a row of memory, from a place that
-    moves back by one element at each step. So the samples of all blocks shift by one without
-    being copied, and only the first element of each block has to be written.
+    newest first; `windows` are the sizes of these blocks. The observations lie one after
+    another in a row of memory, from a place that moves back by one element at each step. So the
+    samples of all blocks shift by one without being copied, and only the first element of each
+    block has to be written.
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
@@ -290,14 +290,18 @@ class _Window:
         self._place = STEPS_PER_SHIFT  # of the first observation in the row
 
     def present(self) -> Observations:
-        """Return the current observations."""
+        """Return a copy of the present observations, shape (n, size)."""
         return self._view().copy()
 
     def _view(self) -> Observations:
         return self._row[self._place : self._place + self._elements].reshape(self._shape)
 
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
-        """Begin an episode of some plants at rest, with y_d(0) and the action for no flow."""
+        """Begin an episode of some plants at rest.
+
+        `which` are the indices of these plants, `setpoint` is y_d(0), degC, and `rest_action`
+        is the action for u = 0; both have the shape (len(which),), or () for all plants.
+        """
         observations = np.zeros((len(which), self._shape[1]), np.float32)
         observations[self._all_actions] = np.reshape(np.clip(rest_action, -1.0, 1.0), (-1, 1))
         if self._setpoints is not None:
@@ -309,7 +313,10 @@ class _Window:
     def add(
         self, setpoint: Values, error: Values, output: Values, action: Values
     ) -> Observations:
-        """Add a sample of all plants, each of shape (n,), and return the observations."""
+        """Add a sample of all plants, and return the observations, shape (n, size).
+
+        The arguments have the shape (n,): y_d, the measured error and output, degC, and a.
+        """
         if self._place == 0:
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]
             self._place = STEPS_PER_SHIFT

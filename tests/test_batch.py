@@ -13,7 +13,8 @@ from gymnasium.vector import AutoresetMode
 from scipy.signal import lfilter
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters
-from mptc_gym.batch import FACTORS, INFO
+from mptc_gym.env import INFO
+from mptc_gym.plant import FACTORS
 from tests.conftest import MODES, NOISY, assert_the_seed_is_all_that_differs
 
 
