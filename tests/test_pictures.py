@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.compare import plots
 from benchmarks.controllers.roster import looks
-from benchmarks.lib.pictures import STYLE, open_picture, scale_by_ratio
+from benchmarks.lib.pictures import STYLE, scale_by_ratio
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
 from benchmarks.plots import sweep
@@ -183,16 +183,3 @@ def test_any_sweep_can_be_drawn(columns, tmp_path):
         path = tmp_path / "map.png"
         sweep.draw(shown, path, Parameters())
         assert path.stat().st_size > 1000
-
-
-def test_a_picture_that_fails_leaves_the_old_one(tmp_path):
-    path = tmp_path / "picture.png"
-    path.write_text("old")
-
-    def fail():
-        with open_picture(path, 2.0, "a title"):
-            raise ArithmeticError
-
-    with pytest.raises(ArithmeticError):
-        fail()
-    assert path.read_text() == "old"

@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from benchmarks.lib.storage import replacing
-
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
@@ -66,7 +64,7 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
     Parameters
     ----------
     path : Path
-        The file. It is written completely or not at all.
+        The file.
     height : float
         Height of the picture, inches. The width is `WIDTH`.
     title : str
@@ -81,21 +79,31 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         sentence = textwrap.fill(title[0].upper() + title[1:], TITLE_CHARACTERS)
         figure.suptitle(sentence, x=0.015, ha="left", fontsize=10, weight="bold")
         yield figure
-        with replacing(path) as partial_file:
-            figure.savefig(partial_file)
-            picture = Image.open(partial_file).convert("RGB")
-            # The clustering keeps the colours of small marks.
-            smaller = picture.quantize(PALETTE, Image.Quantize.MAXCOVERAGE, kmeans=3)
-            smaller.save(partial_file)
+        figure.savefig(path)
+    picture = Image.open(path).convert("RGB")
+    # The clustering keeps the colours of small marks.
+    picture.quantize(PALETTE, Image.Quantize.MAXCOVERAGE, kmeans=3).save(path)
 
 
 @dataclass(frozen=True)
 class Panels:
-    """A figure with a panel for each of several names, in rows."""
+    """A figure with a panel for each of several names, in rows.
+
+    Attributes
+    ----------
+    figure : Figure
+        The figure.
+    axes : sequence of Axes
+        The panels, one for each name.
+    unused : sequence of Axes
+        The empty places at the end of the last row.
+    columns : int
+        Number of panels in a full row.
+    """
 
     figure: Figure
-    axes: Sequence[Axes]  # one for each name
-    unused: Sequence[Axes]  # the empty places at the end of the last row
+    axes: Sequence[Axes]
+    unused: Sequence[Axes]
     columns: int
 
     def label_edges(self, x: str, y: str) -> None:
