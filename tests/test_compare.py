@@ -18,7 +18,7 @@ import pytest
 
 from agents import PIController
 from benchmarks.bounds.least import least_possible
-from benchmarks.compare import comparison, plots
+from benchmarks.compare import comparison, plots, report
 from benchmarks.compare.__main__ import main
 from benchmarks.compare.comparison import estimate, ranked, scale_of
 from benchmarks.controllers.roster import ROSTER, looks
@@ -133,7 +133,7 @@ class TestEstimates:
         found = estimate(runs, scales)
         scores = ranked(found)
         assert scores["b"].value == pytest.approx(0.75)
-        best, other = comparison.score_table(runs, found, scores).to_dict("records")
+        best, other = report.score_table(runs, found, scores).to_dict("records")
         assert (best["controller"], best["travel (t/h)"], best["square"]) == (
             "b", "12", "0.75",
         )  # fmt: skip
@@ -408,7 +408,7 @@ class TestCompare:
 
     def test_the_costs_have_the_robustness_of_the_linear_controllers(self):
         specs = {name: ROSTER[name] for name in ("pi", "pi-simc", "smith", "dahlin", "mpc")}
-        table = comparison.costs_table([], specs, SCENARIOS["square"])
+        table = report.costs_table([], specs, SCENARIOS["square"])
         assert table["Ms"].tolist() == ["unstable", "1.60", "1.60", "1.60", ""]
         delays = table["stable with delays of (samples)"].tolist()
         assert delays == ["none around the plant's", "0 to 56", "0 to 52", "0 to 54", ""]
