@@ -53,7 +53,7 @@ REFUSED = {
     "compare": [
         (["--agents", "nn", "pie"], "--agents: no 'pie'; there are idle, nn, "),
         (["--agents", "nothing"], "--agents: 'nothing' is now called 'idle'"),
-        (["--agent", "mine=none.json"], "must be .* of a module or a file that is there"),
+        (["--agent", "mine=none.json"], "must be .* of a module or a file that exists"),
         (["--agents"], "no controller"),
         (["--scenarios", "circle"], "no 'circle'"),
         (["--scenarios"], "--scenarios: none to run"),
