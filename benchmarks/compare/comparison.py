@@ -277,4 +277,8 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
                 ends = pd.Series([getattr(cell, end, math.nan) for cell in cells])
                 columns[f"{name}{suffix}"] = ends.replace([math.inf, -math.inf], math.nan)
     numbers = pd.DataFrame(columns)
-    write_csv(path, numbers.astype(object).where(numbers != math.inf, "not settled"))
+    for name in numbers:
+        is_infinite = numbers[name] == math.inf
+        if is_infinite.any():
+            numbers[name] = numbers[name].astype(object).mask(is_infinite, "not settled")
+    write_csv(path, numbers)

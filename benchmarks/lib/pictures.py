@@ -70,19 +70,20 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
     title : str
         A sentence, which is broken into lines.
     """
-    import matplotlib as mpl  # here: slow to import, and many reports have no picture
+    from matplotlib import rc_context  # here: slow to import, and not for all reports
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from PIL import Image
 
-    with mpl.rc_context(STYLE):
+    with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, height))
         sentence = textwrap.fill(title[0].upper() + title[1:], TITLE_CHARACTERS)
         figure.suptitle(sentence, x=0.015, ha="left", fontsize=10, weight="bold")
         yield figure
-        figure.savefig(path)
-    picture = Image.open(path).convert("RGB")
-    # The clustering keeps the colours of small marks.
-    picture.quantize(PALETTE, Image.Quantize.MAXCOVERAGE, kmeans=3).save(path)
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.draw()  # once; `Figure.savefig` would draw twice because of the layout
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    picture.quantize(PALETTE, Image.Quantize.FASTOCTREE).save(path)
 
 
 @dataclass(frozen=True)
