@@ -238,7 +238,7 @@ def compared(tmp_path):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Leave out the pictures, which take most of the time."""
-    for name in ("plot_scores", "plot_travel", "plot_responses"):
+    for name in ("plot_scores", "plot_responses"):
         monkeypatch.setattr(plots, name, lambda *_: None)
 
 
@@ -268,7 +268,7 @@ class TestCompare:
         assert provenance["options"]["agents"] == ["nn", "pi", "mpc"]
         assert {"gymnasium", "numpy"} <= set(provenance["versions"])
         assert len(pd.read_csv(out / "constant.csv")) == 2 * 600 + 600
-        for name in ("constant", "constant-noise", "scores", "travel"):
+        for name in ("constant", "constant-noise", "scores"):
             picture = matplotlib.image.imread(out / f"{name}.png")
             assert len(np.unique(picture[::4, ::4] @ [1.0, 2.0, 4.0, 0.0])) > 20  # colours
 

@@ -31,20 +31,6 @@ class TestFindings:
         )
         assert plots.scores_finding({"mine": estimates["mine"]}) == "mine scores 0.900"
 
-    def test_of_travel(self):
-        rows = [
-            # scenario, agent, error, travel: in "a", Smith's error is 6 % above the smallest.
-            ("a", "smith", 1.06, 10.0), ("a", "pi", 1.04, 20.0), ("a", "mpc", 1.0, 30.0),
-            ("b", "smith", 1.04, 10.0), ("b", "pi", 1.00, 20.0), ("b", "mpc", 2.0, 1.0),
-            ("c", "smith", 3.00, 10.0), ("c", "pi", 1.00, 20.0), ("c", "mpc", 2.0, 1.0),
-        ]  # fmt: skip
-        means = pd.DataFrame(rows, columns=["scenario", "agent", "mae", "travel"])
-        finding = plots.travel_finding(means)
-        assert finding.endswith("PI (1992) moves the valve least in 2 of 3 cases")
-        assert "within 5 % of the smallest" in finding
-        alone = plots.travel_finding(means[means["agent"] == "pi"])
-        assert alone == "Mean error and valve travel of PI (1992)"
-
     def test_of_responses(self):
         errors = pd.Series({"mpc": 0.5, "nn": 1.0, "pi": 1.27})
         finding = plots.responses_finding(errors)

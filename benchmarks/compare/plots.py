@@ -8,25 +8,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import NullLocator
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.controllers.roster import label, looks
-from benchmarks.lib.pictures import (
-    DEAD_ZONE,
-    LIMIT,
-    RATIO_LABEL,
-    SETPOINT,
-    excess,
-    open_panels,
-    open_picture,
-    percent,
-    scale_by_ratio,
-)
+from benchmarks.lib.pictures import DEAD_ZONE, LIMIT, SETPOINT, open_picture
 from benchmarks.lib.statistics import Estimate, written
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
@@ -43,7 +32,6 @@ BAND: Any = {"alpha": 0.3, "linewidth": 0}  # the 10th to 90th percentile of the
 
 MARKER_SIZE = 6.0  # points
 MARKER_SIZES = {"*": 8.0, "D": 5.0}  # points; these markers then look as large as the others
-NEARLY_BEST = 1.05  # An error up to this multiple of the smallest error is nearly the smallest.
 
 
 def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: Path) -> None:
@@ -128,89 +116,6 @@ def _scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
     axes.set_xscale("log")
     axes.set_xticks(distance(SCORE_TICKS), labels)
     axes.set_xlim(start, end)
-    axes.xaxis.set_minor_locator(NullLocator())
-
-
-def plot_travel(
-    runs: pd.DataFrame, estimates: pd.DataFrame, agents: Sequence[str], path: Path
-) -> None:
-    """Draw the mean error and the mean valve travel of each controller that moves the valve.
-
-    Parameters
-    ----------
-    runs : pandas.DataFrame
-        A row for each run, with `scenario`, `agent`, `mae` (degC) and `total_variation` (t/h).
-    estimates : pandas.DataFrame
-        A row for each scenario and controller, with the lowest achievable error `limit`, degC.
-    agents : sequence of str
-        The controllers in the order of the legend.
-    path : Path
-        The PNG file. None is written if no controller moves the valve.
-    """
-    means = travel_means(runs, estimates)
-    if means.empty:
-        return
-    moving_agents = set(means["agent"])
-    marks = marks_of([agent for agent in agents if agent in moving_agents])
-    scenarios = [str(scenario) for scenario in means["scenario"].unique()]
-    with open_panels(path, scenarios, 2.4, 2, travel_finding(means)) as panels:
-        for axes, scenario in zip(panels.axes, scenarios, strict=True):
-            rows = means[means["scenario"] == scenario]
-            for agent, travel, ratio in zip(
-                rows["agent"], rows["travel"], rows["ratio"], strict=True
-            ):
-                axes.plot(travel, excess(ratio), **marks[agent])
-            scale_by_ratio(axes, "y", rows["ratio"])
-            _scale_by_travel(axes, rows["travel"])
-        entries: dict[str, Artist] = {}
-        for agent, mark in marks.items():
-            entries[label(agent)] = Line2D([], [], **mark)
-        panels.label_edges("valve travel of a run (t/h, logarithmic axis)", RATIO_LABEL)
-        panels.add_legend(entries, columns=4)
-
-
-def travel_means(runs: pd.DataFrame, estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean error and valve travel of each controller that moves the valve.
-
-    There is a row for each scenario and controller, with the columns `scenario`, `agent`, `mae`
-    (degC), `ratio` (`mae` divided by the lowest achievable error) and `travel` (t/h). `runs`
-    and `estimates` are those of `plot_travel`.
-    """
-    means = runs.groupby(["scenario", "agent"], sort=False)[["mae", "total_variation"]].mean()
-    means = means.reset_index().rename(columns={"total_variation": "travel"})
-    limits = estimates.groupby("scenario")["limit"].first()
-    means["ratio"] = means["mae"] / means["scenario"].map(limits)
-    return means[means["travel"] > 0.0]
-
-
-def travel_finding(means: pd.DataFrame) -> str:
-    """Return a sentence that names the controller with a small error and little valve travel.
-
-    In each scenario, it is the controller that moves the valve least among the controllers with
-    nearly the smallest error. The sentence names the one of most scenarios. `means` are those
-    of `travel_means`.
-    """
-    if means["agent"].nunique() == 1:
-        return f"Mean error and valve travel of {label(means['agent'].iloc[0])}"
-    winners = []
-    for _, rows in means.groupby("scenario", sort=False):
-        nearly_best = rows[rows["mae"] <= NEARLY_BEST * rows["mae"].min()]
-        winners.append(nearly_best.sort_values("travel")["agent"].iloc[0])
-    counts = pd.Series(winners).value_counts(sort=True)
-    frequency = ""
-    if len(winners) > 1:
-        frequency = f" in {counts.iloc[0]} of {len(winners)} cases"
-    return (
-        f"Among the controllers with an error within {percent(NEARLY_BEST - 1.0)} of the "
-        f"smallest, {label(counts.index[0])} moves the valve least{frequency}"
-    )
-
-
-def _scale_by_travel(axes: Axes, travels: pd.Series[float]) -> None:
-    """Make the x axis logarithmic and long enough for these valve travels, t/h."""
-    axes.set(xscale="log", xlim=(0.7 * travels.min(), 1.4 * travels.max()))
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-    axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_locator(NullLocator())
 
 

@@ -116,8 +116,10 @@ def write(
         tables = [result.responses for result in results if result.scenario == name]
         responses[name] = pd.concat(tables)
         write_numbers(folder / f"{name}.csv", responses[name])
-    scale_of = {scale.scenario.name: scale for scale in scales}
-    scale_of = {name: scale_of[name] for name in scale_of if name in responses}
+    scale_of = {}
+    for scale in scales:
+        if scale.scenario.name in responses:
+            scale_of[scale.scenario.name] = scale
     runs = runs[runs["scenario"].isin(list(scale_of))]
     if runs.empty:
         return
@@ -131,21 +133,21 @@ def write(
     plants = [scale.scenario.parameters for scale in scale_of.values()]
     misfits = misfits_of(controllers, plants)
     comparison = Comparison(
-        controllers,
-        results,
-        scale_of,
-        runs,
-        estimates,
-        anticipations,
-        misfits,
-        ranked(estimates, misfits),
+        controllers=controllers,
+        results=results,
+        scales=scale_of,
+        runs=runs,
+        estimates=estimates,
+        anticipations=anticipations,
+        misfits=misfits,
+        scores=ranked(estimates, misfits),
     )
     draw(comparison, responses, folder)
     write_report(folder, "Comparison of controllers", sections(comparison), origin, printed=2)
 
 
 def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:
-    """Draw scores and valve travel, and the responses of some controllers in each scenario.
+    """Draw the scores, and the responses of some controllers in each scenario.
 
     `responses` are the responses of all controllers by the name of the scenario.
     """
@@ -158,9 +160,6 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
     }
     if fitting:
         plots.plot_scores(fitting, comparison.estimates, folder / "scores.png")
-        of_fitting = runs[runs["agent"].isin(fitting)]
-        path = folder / "travel.png"
-        plots.plot_travel(of_fitting, comparison.estimates, list(fitting), path)
     pictured = [name for name in fitting if comparison.controllers[name].pictured]
     errors = runs.groupby(["scenario", "agent"])["mae"].mean()
     for name, scale in comparison.scales.items():
@@ -183,9 +182,7 @@ def sections(comparison: Comparison) -> list[Section]:
                 comparison.runs, comparison.estimates, comparison.scores, comparison.misfits
             ),
             pictures={
-                "scores.png": "The score of each controller, and a small tick for each case",
-                "travel.png": "Mean error and mean valve travel of each controller; the lower "
-                "left is better",
+                "scores.png": "The score of each controller, and a small tick for each case"
             },
         ),
         Section(
