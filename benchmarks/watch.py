@@ -74,11 +74,11 @@ def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed:
 
     pictures = list(frames(trajectory, parameters, seed))
     palette = pictures[-1].quantize(COLOURS, Quantize.MAXCOVERAGE, kmeans=3)
-    first, *others = [
+    first, *rest = [
         picture.quantize(palette=palette, dither=Dither.NONE) for picture in pictures
     ]
-    durations = [DURATION] * len(others) + [LAST_DURATION]
-    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
+    durations = [DURATION] * len(rest) + [LAST_DURATION]
+    first.save(path, save_all=True, append_images=rest, duration=durations, loop=0)
 
 
 def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterator[Image]":

@@ -212,7 +212,7 @@ class TestKeptResults:
             return {"number": 0.1}
 
         for _ in range(2):
-            done = dict(FanOut(jobs=1).stream({"a": task, "b": task}, kept=kept))
+            done = dict(FanOut(jobs=1).stream({"a": task, "b": task}, store=kept))
             assert done == {"a": {"number": 0.1}, "b": {"number": 0.1}}
         assert len(calls) == 2
 

@@ -57,7 +57,7 @@ def work(options: Options) -> str:
     controllers = chosen(options.agents, options.controllers.agent)
     folder_name, scenarios = cases(options)
     target = options.out or Path("results", folder_name)
-    made = origin()
+    provenance = origin()
     bounds: dict[str, Any] = {}
     cells: dict[str, Any] = {}
     for scenario in scenarios:
@@ -70,31 +70,28 @@ def work(options: Options) -> str:
     tasks = bounds | cells
     # Long tasks start first, so that no core waits long at the end.
     names = sorted(tasks, key=lambda name: -tasks[name].args[0].samples)
+    sorted_tasks = {name: tasks[name] for name in names}
     done: dict[str, Any] = {}
     with results_folder(target) as folder:
         try:
-            done.update(
-                options.controllers.fan_out.stream(
-                    {name: tasks[name] for name in names}, "compare"
-                )
-            )
+            done.update(options.controllers.fan_out.stream(sorted_tasks, "compare"))
         finally:
-            if len(done) < len(tasks):
-                made["missing"] = f"{len(tasks) - len(done)} of {len(tasks)} tasks are missing"
+            missing = len(tasks) - len(done)
+            if missing:
+                provenance["missing"] = f"{missing} of {len(tasks)} tasks are missing"
             results = [done[name] for name in cells if name in done]
             scales = [done[name] for name in bounds if name in done]
             if results:
-                provenance = {
-                    **made,
+                policies = {result.agent: result.policies for result in results}
+                content = {
+                    **provenance,
                     "options": {**asdict(options), "agents": list(controllers)},
                     "seeds": list(range(options.seed, options.seed + options.runs)),
                     "scenarios": {scenario.name: vars(scenario) for scenario in scenarios},
-                    "policies": {
-                        result.agent: result.policies for result in results if result.policies
-                    },
+                    "policies": {name: policies[name] for name in policies if policies[name]},
                 }
-                write_json(folder / "provenance.json", provenance)
-                write(results, scales, controllers, folder, made)
+                write_json(folder / "provenance.json", content)
+                write(results, scales, controllers, folder, provenance)
     return f"The report, tables, data and plots are in {target}/"
 
 

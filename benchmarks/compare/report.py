@@ -309,13 +309,13 @@ def difference_table(estimates: pd.DataFrame) -> pd.DataFrame:
     """Return the differences from the reference, and the shares of runs that are better."""
     if "difference" not in estimates:
         return pd.DataFrame()
-    others = estimates.dropna(subset=["difference"])
+    compared = estimates.dropna(subset=["difference"])
     cells = []
     for difference, improvement in zip(
-        others["difference"], others["improvement"], strict=True
+        compared["difference"], compared["improvement"], strict=True
     ):
         cells.append(f"{difference:+.3f}; {100 * improvement.value:.0f} %")
-    return _by_agent(others, cells, list(others["agent"].unique()))
+    return _by_agent(compared, cells, list(compared["agent"].unique()))
 
 
 def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
@@ -345,7 +345,7 @@ def costs_table(
     rows = []
     for name, controller in controllers.items():
         of_controller = [result for result in results if result.agent == name]
-        # The provenance of a user's own controller says what the roster says of the others.
+        # A user's own controller says in its provenance what the roster says of a controller.
         policies = [policy for result in of_controller for policy in result.policies]
         provenance = policies[0] if policies else {}
         sensitivity, delays = robustness(controller, scenario)

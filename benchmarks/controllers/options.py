@@ -55,14 +55,16 @@ def agent_names(option: str, names: Sequence[str]) -> list[str]:
     return known(option, names, ROSTER)
 
 
-def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, ControllerSpec]:
+def chosen(
+    names: Sequence[str], user_controllers: Sequence[str] = ()
+) -> dict[str, ControllerSpec]:
     """Return the records of controllers by name.
 
     Parameters
     ----------
     names
         Controllers of the roster, as in the option `--agents`.
-    own
+    user_controllers
         A user's own controllers, in the form NAME=LOCATION of the option `--agent`. Several
         locations under one name become the members of one controller.
 
@@ -73,11 +75,11 @@ def chosen(names: Sequence[str], own: Sequence[str] = ()) -> dict[str, Controlle
         A module or a zip file is loaded by the method `members` of the record, which raises
         the error if loading fails.
     """
-    if not (names or own):
+    if not (names or user_controllers):
         raise UsageError("--agents, --agent: no controller to run")
     specs = {name: ROSTER[name] for name in agent_names("--agents", names)}
     locations_of: dict[str, list[str]] = {}
-    for text in own:
+    for text in user_controllers:
         name, location = _split(text)
         locations_of.setdefault(name, []).append(location)
     for name, locations in locations_of.items():

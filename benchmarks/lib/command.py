@@ -259,7 +259,7 @@ class FanOut:
     """Where tasks run: loky for this machine, ray for the Ray cluster at RAY_ADDRESS."""
 
     def stream(
-        self, tasks: Mapping[str, Task], title: str = "", kept: KeptResults | None = None
+        self, tasks: Mapping[str, Task], title: str = "", store: KeptResults | None = None
     ) -> Iterator[tuple[str, Any]]:
         """Run tasks, and yield the name and the result of a task as soon as it has finished.
 
@@ -270,9 +270,9 @@ class FanOut:
             a module. On a Ray cluster, all results come at the end.
         title
             Title of the progress bar; "" for no progress bar.
-        kept
+        store
             Results of an earlier run of the same tasks, which are yielded first. New results
-            are added to them.
+            are added to it.
 
         Raises
         ------
@@ -283,7 +283,7 @@ class FanOut:
         errors: dict[str, str] = {}
         with progress_bar(title, len(tasks)) as advance:
             for name, task in tasks.items():
-                result = kept.load(name) if kept else None
+                result = store.load(name) if store else None
                 if result is None:
                     missing[name] = task
                     continue
@@ -294,8 +294,8 @@ class FanOut:
                 if answer.error:
                     errors[answer.task] = answer.error
                     continue
-                if kept:
-                    kept.save(answer.task, answer.result)
+                if store:
+                    store.save(answer.task, answer.result)
                 yield answer.task, answer.result
         if errors:
             raise UnfinishedError(_summary(errors, len(tasks)))

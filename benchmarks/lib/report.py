@@ -79,8 +79,8 @@ def _in_markdown(section: Section, folder: Path) -> list[str]:
     """Return the blocks of a section in Markdown, with the pictures that are in the folder."""
 
     def cell(text: object) -> str:
-        shown = escape(text)
-        return f"**{shown}**" if text in section.bold else shown
+        escaped = escape(text)
+        return f"**{escaped}**" if text in section.bold else escaped
 
     blocks = []
     if section.title:

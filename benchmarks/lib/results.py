@@ -110,9 +110,9 @@ def _refuse_other_files(place: Path) -> None:
     if place.is_file():
         raise UsageError(f"--out: {place} cannot be written to: it is a file")
     written = {RECORD, *_record(place).get("files", [])}
-    others = [name for name in _files(place) if name not in written]
-    if others:
-        listed = ", ".join(others[:3])
+    foreign = [name for name in _files(place) if name not in written]
+    if foreign:
+        listed = ", ".join(foreign[:3])
         raise UsageError(
             f"--out: {place} holds files that this version did not write ({listed}): remove "
             "the folder, or choose another one"
