@@ -1,6 +1,6 @@
-"""Implement a predictive controller that knows plant and actuator exactly, not the future.
+"""Implement a predictive controller that knows all of the plant and actuator but the future.
 
-It shows how close a controller can come to the bounds of `benchmarks.bounds`.
+Its errors show how close a controller can come to the bounds of `benchmarks.bounds`.
 """
 
 from dataclasses import dataclass
@@ -17,49 +17,59 @@ from mptc_gym.signals import LOAD_INTERVAL, Levels
 
 Array = NDArray[np.float64]
 
-HORIZON = 5  # planned commands; the first is applied, then all are planned again
-SWEEPS, TOLERANCE = 100, 1e-4  # of coordinate descent: most sweeps, and t/h to stop at
-TINY = 1e-9  # degC^2, added to the variance of xi so that the filter trusts the readings
-BISECTIONS = 20  # of a hedged set point: to a millionth of the range of levels
+HORIZON = 5  # flows in a plan; the first is applied, then all are planned again
+SWEEPS = 100  # Coordinate descent stops after this number of sweeps,
+TOLERANCE = 1e-4  # t/h; or if no planned flow changes by this much in a sweep.
+TINY = 1e-9  # added to variances, degC^2, and to divisors, so that none of them is 0
+BISECTIONS = 20  # They find a hedged set point to a millionth of the range of levels.
 WARM_UP = 200  # samples until the covariance of the filter hardly changes
 
 
 def probability_held(
     age: NDArray[np.intp], ahead: NDArray[np.intp], shortest: int, longest: int
 ) -> Array:
-    """Return the probability that a random level still holds `ahead` samples later.
+    """Return the probability that a random level of the set point still holds later.
 
-    A level holds for a number of samples that is uniform from `shortest` to `longest`. It began
-    `age` samples ago. All arguments broadcast together.
+    Parameters
+    ----------
+    age
+        Samples since the level began. The arguments broadcast together.
+    ahead
+        Samples from the present to the time of which the probability is asked.
+    shortest, longest
+        A level holds for a number of samples that is uniform from `shortest` to `longest`.
     """
-    longer = np.clip((longest - age - ahead) / (longest - shortest + 1), 0.0, 1.0)
+    until_then = np.clip((longest - age - ahead) / (longest - shortest + 1), 0.0, 1.0)
     until_now = np.clip((longest - age) / (longest - shortest + 1), TINY, 1.0)
-    return np.asarray(longer / until_now)
+    return np.asarray(until_then / until_now)
 
 
 def hedged_setpoints(setpoint: Array, held: Array, amplitude: float, deviation: Array) -> Array:
-    """Return the outputs to aim at while the set point may change on the way, degC.
+    """Return the outputs to aim at if the set point may change during the delay, degC.
 
-    A flow shows only after the delay. By then the set point is still `setpoint` with the
-    probability `held`, otherwise it is a new level, uniform within +-`amplitude`, degC. Let the
-    output be r + n, where n is normal with the standard deviation `deviation`, degC. The r that
-    minimises E|y_d - r - n| is the median of y_d - n:
+    A flow shows only after the delay. After the delay, the set point y_d is still `setpoint`,
+    degC, with the probability `held`. Otherwise y_d is a new level, uniform between the limits
+    -`amplitude` and `amplitude`, degC. Let the output be r + n, where n is normal with the
+    standard deviation `deviation`, degC. The r that minimises E|y_d - r - n| is the median of
+    y_d - n:
 
         held Phi((r - setpoint) / deviation) + (1 - held) G(r) = 1/2.
 
-    G(r) is the mean of Phi((r - x) / deviation) over all levels x: with the integral of Phi,
-    I(z) = z Phi(z) + phi(z),
+    G(r) is the mean of Phi((r - x) / deviation) over all levels x. With the integral of Phi,
+    I(z) = z Phi(z) + phi(z), it is
 
         G(r) = deviation (I((r + amplitude) / deviation) - I((r - amplitude) / deviation))
                / (2 amplitude).
 
-    The left side rises with r, so bisection finds it. All arguments broadcast together.
+    The left side of the equation rises with r, so bisection finds r. The arguments broadcast
+    together.
     """
     from scipy.special import ndtr  # here: slow to import
 
-    deviation = np.maximum(deviation, TINY)  # without noise the normal law becomes a step
+    deviation = np.maximum(deviation, TINY)  # Without noise, Phi is a step.
     shape = np.broadcast_shapes(*map(np.shape, (setpoint, held, deviation)))
-    low, high = np.full(shape, -amplitude), np.full(shape, amplitude)
+    low = np.full(shape, -amplitude)
+    high = np.full(shape, amplitude)
     for _ in range(BISECTIONS):
         r = (low + high) / 2.0
         below_level = ndtr((r - setpoint) / deviation)
@@ -126,20 +136,21 @@ class _Model:
 
 
 class PredictiveController:
-    """Plan, at each sample, the inputs that bring the expected output to the set point.
+    """Plan, at each sample, the flows that bring the expected output to the set point.
 
-    The controller knows A, B, C and d of the plant (28), even where loop i draws them with seed
-    `seed + i`, and the course of their drift. A Kalman filter estimates the output, xi and the
-    load from the transmitter's readings; for the jumps of the load, which are not normal, it is
-    the best linear filter. The score is the mean of |e|, so the expected outputs are medians:
-    the load is expected to stay as it is. The plan minimises the sum of squared differences
-    between these and the outputs to aim at, over the samples that its commands reach first, for
-    inputs within the limits. A first input inside the dead zone is replaced by 0 or by the
-    input at a command on the edge, whichever gives the better plan.
+    The controller knows A, B, C and d of the plant (28) and the course of their drift, even if
+    run i draws them with the seed `seed + i`. A Kalman filter estimates the output, xi and the
+    load from the transmitter's readings. The jumps of the load are not normal; for them, it is
+    the best linear filter.
 
-    The outputs to aim at are the set point, as if it held for ever. Random set points have a
-    law, which tells from the age of a level how likely it is to change before a command shows:
-    see `hedged_setpoints`.
+    The score depends on the mean of |e|, so the expected outputs are medians, and the load is
+    expected not to change. The plan minimises the sum of squared differences between the
+    expected outputs and the outputs to aim at, over the samples that the planned flows reach
+    first, for flows within the limits. A first flow inside the dead zone is replaced by 0 or by
+    the flow of a command on the edge of the dead zone, whichever gives the better plan.
+
+    The output to aim at is the set point, as if it never changed. If set points are random, the
+    age of a level tells how likely a change is before a flow shows; see `hedged_setpoints`.
 
     Parameters
     ----------
@@ -156,8 +167,8 @@ class PredictiveController:
         self._num_envs = num_envs
         self._numbers = drawn_numbers(parameters, num_envs, seed)
         self._delay = self._numbers.delay.astype(np.intp)
-        # Where the load may change, a level x becomes (1 - p) x in the mean, and its variance
-        # stays the same.
+        # Where the load may change, with the probability p, a level x becomes (1 - p) x in the
+        # mean. The variance of the levels is the same before and after.
         interval = self._numbers.disturbance_interval
         self._load_stays = 1.0 - np.minimum(LOAD_INTERVAL / interval, 1.0)
         load_variance = np.square(self._numbers.disturbance_amplitude) / 3.0  # uniform
