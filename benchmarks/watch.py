@@ -29,15 +29,15 @@ class Options:
     """Make a film of a controller at work."""
 
     agent: str = "nn"
-    """Who controls: a name as in `compare`, or your own, NAME=MODULE:FACTORY."""
+    """The controller: a name as in `compare`, or your own controller, NAME=MODULE:FACTORY."""
     scenario: str | None = None
-    """Case to run, as in `compare`; on a plant of your own: square, constant, run (default:
-    the first)."""
+    """The case to run, as in `compare`. On a plant of your own, the cases are square and
+    constant, or run if the plant has a set point (default: the first case)."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     seed: Seed = 0
-    """Seed of noise and initial weights."""
+    """The seed of the noise and of the initial weights."""
     video: Path | None = None
-    """The film, a .gif file (default: in results/watch)."""
+    """The file of the film, which ends in .gif (default: a file in results/watch)."""
 
 
 def work(options: Options) -> str:
@@ -53,7 +53,7 @@ def work(options: Options) -> str:
     default_path = Path("results/watch", f"{file_name(controller.name)}-{case.name}.gif")
     path = options.video or default_path
     if path.suffix != ".gif":
-        raise UsageError(f"--video: must end in .gif, got {path}")
+        raise UsageError(f"--video: the file must end in .gif, got {path}")
     out_folder(path.absolute().parent, "--video")
     first_member = controller.members()[0]
     trajectory = first_member.run(case.arguments, case.samples, 1, options.seed)

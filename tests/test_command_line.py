@@ -51,15 +51,15 @@ LOG = ROOT / "benchmarks/logs/example.csv"
 REFUSED = {
     "claims": [(["everything"], "no 'everything'")],
     "compare": [
-        (["--agents", "nn", "pie"], "--agents: no 'pie'; there are idle, nn, "),
+        (["--agents", "nn", "pie"], "--agents: no 'pie'; choose from idle, nn, "),
         (["--agents", "nothing"], "--agents: 'nothing' is now called 'idle'"),
         (["--agent", "mine=none.json"], "must be .* of a module or a file that exists"),
-        (["--agents"], "no controller"),
+        (["--agents"], "name at least one controller"),
         (["--scenarios", "circle"], "no 'circle'"),
-        (["--scenarios"], "--scenarios: none to run"),
+        (["--scenarios"], "--scenarios: name at least one case"),
         (["--runs", "2.5"], "for --runs: must be a whole number, got 2.5"),
         (["--preset", "paper", "--presets"], "--presets cannot be combined with --plant"),
-        (["--preset", "paper", "--scenarios", "load"], "no 'load'; there are square, constant"),
+        (["--preset", "paper", "--scenarios", "load"], "no 'load'; choose from square, con"),
         (["--rusn", "3"], "Unknown option: --rusn. Did you mean --runs"),
         (["--set", "delay"], "ARGUMENT=VALUE"),
         (["--set", "dely=3"], "'dely': did you mean 'delay'?"),
@@ -96,8 +96,8 @@ REFUSED = {
         (["--agent", "nn-smith"], "--agent: 'nn-smith' is now called 'neural-smith'"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
         (["--scenario", "triangle"], "--scenario.*constant-noise"),
-        (["--preset", "paper", "--scenario", "load"], "no 'load'; there are square, constant"),
-        (["--video", "film.avi"], "--video: must end in .gif"),
+        (["--preset", "paper", "--scenario", "load"], "no 'load'; choose from square, con"),
+        (["--video", "film.avi"], "--video: the file must end in .gif"),
     ],
 }  # fmt: skip
 

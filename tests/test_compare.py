@@ -303,7 +303,7 @@ class TestCompare:
         runs = pd.read_csv(out / "runs.csv")
         assert runs["mae"].tolist() == pytest.approx([0.283], abs=0.001)  # that of the gains
         said = capsys.readouterr().out
-        assert "2 of 4 tasks failed; the others are done" in said
+        assert "2 of 4 tasks failed; the other tasks have finished" in said
         assert "bad, constant: " in said
         assert "--agent: 'my_controllers:Mine' cannot be loaded: AttributeError" in said
         assert not (tmp_path / "out").exists()

@@ -59,7 +59,7 @@ class TestFolder:
             run(target, {"report.md": "half"}, error=error())
         assert contents(target) == {"report.md": "old", "old.csv": "1"}
         assert contents(unfinished(target)) == {"report.md": "half"}
-        assert f"what has finished is in {unfinished(target)}/." in capsys.readouterr().out
+        assert f"results so far are in {unfinished(target)}/." in capsys.readouterr().out
         run(target, {"new.csv": "2"})  # which begins anew
         assert contents(target) == {"new.csv": "2"}
         assert not unfinished(target).exists()
@@ -116,10 +116,10 @@ class TestUnfinished:
 
     def test_the_same_run_goes_on_and_ends_with_the_files_of_both(self, target, capsys):
         self.stop(target, CONDITIONS)
-        assert "; the same command goes on from there." in capsys.readouterr().out
+        assert "The same command continues with them." in capsys.readouterr().out
         (unfinished(target) / "tasks").mkdir()
         run(target, {"report.md": "new"}, CONDITIONS)
-        assert "goes on from what has finished in" in capsys.readouterr().out
+        assert "The run continues with the results in" in capsys.readouterr().out
         assert contents(target) == {"half.csv": "1", "report.md": "new"}
 
     @pytest.mark.parametrize("conditions", [None, {"options": {"runs": 4}}])
@@ -127,7 +127,7 @@ class TestUnfinished:
         self.stop(target, CONDITIONS)
         run(target, {"report.md": "new"}, conditions)
         assert contents(target) == {"report.md": "new"}
-        said = "is of other options, code or packages: the run begins anew."
+        said = "are of other options, code or packages."
         assert (said in capsys.readouterr().out) == (conditions is not None)
 
     def test_options_count_but_not_where_tasks_run(self, tmp_path):

@@ -22,12 +22,13 @@ from benchmarks.loop.scenarios import (
 from mptc_gym.evaluation import SEED
 
 _SCENARIOS_HELP = (
-    f"Cases to run (default: all). Of the paper: {', '.join(SCENARIOS)}. With --presets: "
-    f"{', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set: "
-    f"{', '.join(setpoint.name for setpoint in SETPOINTS)}."
+    f"The cases to run (default: all). The cases of the paper are {', '.join(SCENARIOS)}. With "
+    f"--presets, the cases are {', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set, "
+    f"the cases are {', '.join(setpoint.name for setpoint in SETPOINTS)}."
 )
 _OUT_HELP = (
-    "Folder (default: results/compare; compare-presets or compare-plant for other cases)."
+    "The folder to write to (default: results/compare; results/compare-presets with --presets; "
+    "results/compare-plant with --plant, --preset or --set)."
 )
 
 
@@ -41,11 +42,11 @@ class Options:
     scenarios: Annotated[Names | None, Parameter(help=_SCENARIOS_HELP)] = None
     plant: PlantOptions = field(default_factory=PlantOptions)
     presets: bool = False
-    """Run the environment's presets instead of the paper's cases."""
+    """Run the presets of the environment instead of the cases of the paper."""
     runs: Runs = 100
-    """Runs of each controller in each case."""
+    """The number of runs of each controller in each case."""
     seed: Seed = SEED
-    """Seed of the first run (default: that of the published episodes)."""
+    """The seed of the first run (default: the seed of the first published episode)."""
     out: Annotated[Folder | None, Parameter(help=_OUT_HELP)] = None
 
 
@@ -108,7 +109,7 @@ def cases(options: Options) -> tuple[str, list[Scenario]]:
     wanted = list(available) if options.scenarios is None else options.scenarios
     scenarios = [available[name] for name in known("--scenarios", wanted, available)]
     if not scenarios:
-        raise UsageError("--scenarios: none to run")
+        raise UsageError("--scenarios: name at least one case")
     return folder_name, scenarios
 
 

@@ -25,33 +25,40 @@ from benchmarks.loop.rollout import CHANGE, START
 from benchmarks.loop.scenarios import Scenario
 
 SCORE = (
-    "A score is the mean over the cases, with its 95 % interval. Valve travel is the mean over "
-    "all runs."
+    "The score of a controller is the mean of its scores in the cases, with a 95 % interval. "
+    "The valve travel is the mean over all runs. The last columns have the score in each "
+    "case."
 )
 BOUND = (
-    "The first row is the least possible error of controllers without foresight. Where it is "
-    "marked *, the plant has settled before each change of the set point; a controller that "
-    "knows when the changes come can do better, down to the second row."
+    "The first row is the least possible error of a controller without foresight. The mark * "
+    "means that the plant has settled before each change of the set point. In a case with "
+    "this mark, a controller that knows when the set point changes can have a smaller error, "
+    "down to the error in the second row."
 )
 ANTICIPATES = (
-    "‡ The controller moves before the square wave changes. Its score in this case is that of "
-    "runs with the same seeds in which nobody can foresee the changes."
+    "‡ The controller moves the valve before the square wave changes. Its score in this case "
+    "is the score in runs with the same seeds in which nobody can foresee the changes."
 )
 SURPRISED = (
-    "These controllers move before the square wave changes. The table shows how much of the "
-    "change they have made before they can have seen it. A controller that knows the period of "
-    "the square wave can reach the error with foresight. The last column divides the error in "
-    "runs whose changes nobody can foresee by the least possible error of these runs."
+    "These controllers move the valve before the square wave changes. The column 'moved "
+    "before the change' has the share of a change that the temperature has made before it can "
+    "respond to the change. A controller that knows the period of the square wave can reach "
+    "the error with foresight. The last column is the error ratio in runs whose changes "
+    "nobody can foresee."
 )
 PAIRED = (
-    "A number below 0 means that the controller is better. The percentage is the share of runs "
-    "in which it is better."
+    "If a difference is below 0 °C, the controller has a smaller error than the reference. "
+    "The percentage is the share of runs in which the controller has a smaller error."
+)
+HARD = (
+    "The mean error is the sum of the contributions of three parts of a run. All columns are "
+    "in °C."
 )
 ROBUST = (
-    "Linear controllers have an Ms, the largest magnitude of the loop's sensitivity, and a "
-    "range of delays with which the loop is stable. Both are computed for the nominal plant "
-    "of the first case, away from the dead zone and the limits. PI (SIMC), Smith and Dahlin "
-    "are tuned to the same Ms."
+    "The loop of a linear controller has an Ms, which is the largest magnitude of its "
+    "sensitivity function, and a range of delays with which the loop is stable. Both are "
+    "computed for the nominal plant of the first case, away from the dead zone and the "
+    "limits. PI (SIMC), Smith and Dahlin are tuned to the same Ms."
 )
 MISFIT = "†"  # marks controllers that were made for another plant
 PARTS = {  # the columns of a part of the mean error, and of the mean error
@@ -202,7 +209,7 @@ def sections(comparison: Comparison) -> list[Section]:
         ),
         Section(
             "Where the error arises: hard",
-            ["The columns are the contributions of parts of the run to the mean error, in °C."],
+            [HARD],
             parts_table(comparison.runs),
         ),
         Section(
@@ -242,7 +249,7 @@ def notes(comparison: Comparison) -> list[str]:
     if comparison.anticipations:
         texts.add(ANTICIPATES)
     not_ranked = [
-        f"{MISFIT} Not ranked, as its error here is no result: {reason}"
+        f"{MISFIT} {reason} So its error is no measure of the controller, which is not ranked."
         for reason in comparison.misfits.values()
     ]
     return [*sorted(texts), *not_ranked]

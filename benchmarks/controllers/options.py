@@ -27,7 +27,9 @@ from mptc_gym.evaluation import case_of
 from mptc_gym.fit import check_fit
 from mptc_gym.policies import start
 
-AgentNames = Annotated[Names, Parameter(help=f"Controllers to run, of {', '.join(ROSTER)}.")]
+AgentNames = Annotated[
+    Names, Parameter(help=f"The controllers to run, from {', '.join(ROSTER)}.")
+]
 FORMS = (
     "NEW_NAME=MODULE:FACTORY, NEW_NAME=PPO:FILE.zip, NEW_NAME=gains.json of benchmarks.tune or "
     "NEW_NAME=FILE.npz of benchmarks.train"
@@ -40,10 +42,10 @@ class ControllerOptions:
     """A user's own controllers, and where controllers run."""
 
     agent: Names = ()
-    """A controller of your own in addition to those of --agents: NAME=MODULE:FACTORY;
-    NAME=PPO:FILE.zip, of Stable-Baselines3 (loading a zip runs the code in it);
-    NAME=gains.json, which benchmarks.tune writes; or NAME=FILE.npz, of benchmarks.train. The
-    same name again adds another training of it."""
+    """A controller of your own, which runs in addition to those of --agents. Its form is
+    NAME=MODULE:FACTORY; NAME=PPO:FILE.zip for a model of Stable-Baselines3 (loading a zip runs
+    the code in it); NAME=gains.json for a file of benchmarks.tune; or NAME=FILE.npz for a file
+    of benchmarks.train. The same name again adds another training of the controller."""
     fan_out: FanOut = field(default_factory=FanOut)
 
 
@@ -76,7 +78,7 @@ def chosen(
         the error if loading fails.
     """
     if not (names or user_controllers):
-        raise UsageError("--agents, --agent: no controller to run")
+        raise UsageError("--agents, --agent: name at least one controller")
     specs = {name: ROSTER[name] for name in agent_names("--agents", names)}
     locations_of: dict[str, list[str]] = {}
     for text in user_controllers:

@@ -98,7 +98,9 @@ Runs = Annotated[int, _integers(1, 100_000)]
 Seed = Annotated[int, _integers(0, 2**63)]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
-Folder = Annotated[Path, Parameter(help="Folder to write to.", converter=_folder, n_tokens=1)]
+Folder = Annotated[
+    Path, Parameter(help="The folder to write to.", converter=_folder, n_tokens=1)
+]
 
 
 @contextmanager
@@ -117,7 +119,7 @@ def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[st
     """
     for name in listed:
         if name not in names:
-            raise UsageError(f"{option}: no {name!r}; there are {', '.join(names)}")
+            raise UsageError(f"{option}: there is no {name!r}; choose from {', '.join(names)}")
     return list(dict.fromkeys(listed))
 
 
@@ -254,9 +256,9 @@ class FanOut:
     """
 
     jobs: Count | None = None
-    """Number of tasks run at once (default: one per core)."""
+    """The number of tasks that run at once (default: one per core)."""
     backend: Literal["loky", "ray"] = "loky"
-    """Where tasks run: loky for this machine, ray for the Ray cluster at RAY_ADDRESS."""
+    """Where tasks run: loky is this machine, and ray is the Ray cluster at RAY_ADDRESS."""
 
     def stream(
         self, tasks: Mapping[str, Task], title: str = "", store: KeptResults | None = None
@@ -324,7 +326,7 @@ class FanOut:
             yield from answers
         except BrokenProcessPool as error:
             raise UnfinishedError(
-                "a process was killed, perhaps for lack of memory: try fewer --jobs"
+                "a process was killed, perhaps because memory ran out: try fewer --jobs"
             ) from error
 
 
@@ -356,7 +358,7 @@ def _summary(errors: Mapping[str, str], tasks: int) -> str:
 
     `errors` are texts by the name of the task. The last line of a text names the error.
     """
-    lines = [f"{len(errors)} of {tasks} tasks failed; the others are done"]
+    lines = [f"{len(errors)} of {tasks} tasks failed; the other tasks have finished"]
     for name, text in list(errors.items())[:20]:
         lines.append(f"{name}: {text.splitlines()[-1]}")
     lines.append(next(iter(errors.values())))

@@ -126,10 +126,10 @@ def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
     if is_in_use and not record:
         raise UsageError(f"--out: {unfinished} holds files that no run wrote: remove it")
     if conditions and record.get("conditions") == conditions:
-        print(f"The run goes on from what has finished in {unfinished}/", flush=True)
+        print(f"The run continues with the results in {unfinished}/", flush=True)
         return
     if conditions and is_in_use:
-        print(f"{unfinished}/ is of other options, code or packages: the run begins anew.")
+        print(f"The results in {unfinished}/ are of other options, code or packages.")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir()
     write_json(unfinished / RECORD, {"command": COMMAND_LINE.get(), "conditions": conditions})
@@ -140,8 +140,9 @@ def _keep_or_remove(unfinished: Path, conditions: Mapping[str, Any] | None) -> N
     if _files(unfinished) == [RECORD]:
         shutil.rmtree(unfinished)
         return
-    next_step = "; the same command goes on from there" if conditions else ""
-    print(f"\nUnfinished: what has finished is in {unfinished}/{next_step}.", flush=True)
+    print(f"\nThe run has not finished. Its results so far are in {unfinished}/.", flush=True)
+    if conditions:
+        print("The same command continues with them.", flush=True)
 
 
 def _finish(unfinished: Path, place: Path) -> None:
