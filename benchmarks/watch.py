@@ -35,7 +35,7 @@ class Options:
     constant, or run if the plant has a set point (default: the first case)."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     seed: Seed = 0
-    """The seed of the noise and of the initial weights."""
+    """The seed of noise and initial weights."""
     video: Path | None = None
     """The file of the film, which ends in .gif (default: a file in results/watch)."""
 

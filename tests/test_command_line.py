@@ -51,7 +51,7 @@ LOG = ROOT / "benchmarks/logs/example.csv"
 REFUSED = {
     "claims": [(["everything"], "no 'everything'")],
     "compare": [
-        (["--agents", "nn", "pie"], "--agents: no 'pie'; choose from idle, nn, "),
+        (["--agents", "nn", "pie"], "--agents: there is no 'pie'; choose from idle, nn, "),
         (["--agents", "nothing"], "--agents: 'nothing' is now called 'idle'"),
         (["--agent", "mine=none.json"], "must be .* of a module or a file that exists"),
         (["--agents"], "name at least one controller"),

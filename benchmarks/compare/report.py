@@ -47,8 +47,8 @@ SURPRISED = (
     "nobody can foresee."
 )
 PAIRED = (
-    "If a difference is below 0 °C, the controller has a smaller error than the reference. "
-    "The percentage is the share of runs in which the controller has a smaller error."
+    "If a difference is below 0 °C, the controller has a smaller error than the controller in "
+    "the heading. The percentage is the share of runs in which its error is smaller."
 )
 HARD = (
     "The mean error is the sum of the contributions of three parts of a run. All columns are "
