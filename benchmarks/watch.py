@@ -89,7 +89,7 @@ def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterat
     """
     from PIL import Image
 
-    from mptc_gym.drawing import frame  # here: the extra "render" has pygame
+    from mptc_gym.drawing import frame  # imported here, as it needs pygame
     from mptc_gym.record import Record
 
     drawn = drawn_numbers(parameters, 1, seed)

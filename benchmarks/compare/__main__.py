@@ -51,7 +51,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run the comparison and write its results; after an error, those that have finished."""
+    """Run the comparison and write its results; write finished results after an error, too."""
     from benchmarks.compare.comparison import run_case, scale_of
     from benchmarks.compare.report import write
 

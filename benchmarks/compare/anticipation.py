@@ -138,7 +138,9 @@ def _run_surprised(
 
     If all runs of a member are equal (`are_equal`), it runs once with each timetable.
     """
-    from benchmarks.bounds.least import least_possible  # here: SciPy is slow to import
+    from benchmarks.bounds.least import (
+        least_possible,
+    )  # imported here, as SciPy is slow to import
 
     errors = []
     least_errors: list[float] = []

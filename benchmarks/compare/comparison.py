@@ -142,7 +142,9 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     Run i has the seed `seed + i`. An error is raised if no controller can do better than an
     idle valve.
     """
-    from benchmarks.bounds.least import least_possible  # here: SciPy is slow to import
+    from benchmarks.bounds.least import (
+        least_possible,
+    )  # imported here, as SciPy is slow to import
 
     arguments = {
         "samples": scenario.samples,
@@ -151,7 +153,7 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
         **scenario.arguments,
     }
     least = least_possible(**arguments)
-    least.score(0.0)  # raises the error
+    least.score(0.0)  # This raises the error.
     preview = least_possible(kind="preview", **arguments)
     return Scale(scenario, least, preview.value)
 
@@ -169,7 +171,7 @@ def estimate(
         A row for each run, with `scenario`, `agent`, `policy`, `seed` and `mae`. The agent of
         the first row is the reference for the differences.
     scales : mapping
-        The scale of each scenario by name. Other scenarios are left out.
+        The scale of each scenario by name. Scenarios without a scale are left out.
     anticipations : mapping
         The anticipations of controllers.
 

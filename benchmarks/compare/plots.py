@@ -59,7 +59,7 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
             ticks: Any = {"color": mark["color"], "marker": "|", "ms": 9, "mew": 1.4, "ls": ""}
             axes.plot(distance(scenario_scores), height, **ticks)
             axes.plot(distance(score.value), row, **mark)
-            place = (1.01, row)  # right of the axes
+            place = (1.01, row)  # to the right of the axes
             text = written(score.value, ".3f")
             axes.annotate(text, place, xycoords=("axes fraction", "data"), va="center")
         axes.set_yticks(range(len(scores)), [label(agent) for agent in scores])

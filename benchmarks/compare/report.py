@@ -158,7 +158,7 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
 
     `responses` are the responses of all controllers by the name of the scenario.
     """
-    from benchmarks.compare import plots  # here: matplotlib is slow to import
+    from benchmarks.compare import plots  # imported here, as matplotlib is slow to import
 
     runs = comparison.runs
     misfits = comparison.misfits
@@ -291,7 +291,7 @@ def ratio_table(
 
 
 def anticipation_table(anticipations: Anticipations, estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return what controllers gain that move before a square wave changes, in a row each."""
+    """Return what controllers gain by moving before a square wave changes, in a row each."""
     rows = []
     for row in estimates.to_dict("records"):
         anticipation = anticipations.get((row["scenario"], row["agent"]))
@@ -345,7 +345,7 @@ def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
 def costs_table(
     results: Sequence[Result], controllers: Mapping[str, ControllerSpec], scenario: Scenario
 ) -> pd.DataFrame:
-    """Return the knowledge, the robustness and the costs of each controller, in a row each.
+    """Return the knowledge, robustness and costs, with a row for each controller.
 
     The robustness of a linear controller is that with the nominal plant of the scenario.
     """

@@ -18,8 +18,8 @@ from mptc_gym.signals import LOAD_INTERVAL, Levels
 Array = NDArray[np.float64]
 
 HORIZON = 5  # flows in a plan; the first is applied, then all are planned again
-SWEEPS = 100  # Coordinate descent stops after this number of sweeps,
-TOLERANCE = 1e-4  # t/h; or if no planned flow changes by this much in a sweep.
+SWEEPS = 100  # the largest number of sweeps of coordinate descent
+TOLERANCE = 1e-4  # t/h; coordinate descent stops if a sweep changes no flow by this much
 TINY = 1e-9  # added to variances, degC^2, and to divisors, so that none of them is 0
 BISECTIONS = 20  # They find a hedged set point to a millionth of the range of levels.
 WARM_UP = 200  # samples until the covariance of the filter hardly changes
@@ -64,7 +64,7 @@ def hedged_setpoints(setpoint: Array, held: Array, amplitude: float, deviation: 
     The left side of the equation rises with r, so bisection finds r. The arguments broadcast
     together.
     """
-    from scipy.special import ndtr  # here: slow to import
+    from scipy.special import ndtr  # imported here, as SciPy is slow to import
 
     deviation = np.maximum(deviation, TINY)  # Without noise, Phi is a step.
     shape = np.broadcast_shapes(*map(np.shape, (setpoint, held, deviation)))
@@ -84,7 +84,7 @@ def hedged_setpoints(setpoint: Array, held: Array, amplitude: float, deviation: 
 
 def _integral_of_phi(z: Array) -> Array:
     """Return the integral of the standard normal distribution function up to z."""
-    from scipy.special import ndtr  # here: slow to import
+    from scipy.special import ndtr  # imported here, as SciPy is slow to import
 
     density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
     return np.asarray(z * ndtr(z) + density)
@@ -171,7 +171,9 @@ class PredictiveController:
         # mean. The variance of the levels is the same before and after.
         interval = self._numbers.disturbance_interval
         self._load_stays = 1.0 - np.minimum(LOAD_INTERVAL / interval, 1.0)
-        load_variance = np.square(self._numbers.disturbance_amplitude) / 3.0  # uniform
+        load_variance = (
+            np.square(self._numbers.disturbance_amplitude) / 3.0
+        )  # of a uniform level
         steps_variance = load_variance * (1.0 - np.square(self._load_stays))
         walk_variance = LOAD_INTERVAL * self._numbers.disturbance_walk_variance
         noise_variance = self._numbers.noise_variance + TINY

@@ -215,7 +215,7 @@ def _load_zip(location: str) -> UserCode:
 
     A model acts in the environment that its file describes, or else in the plain environment.
     """
-    import stable_baselines3  # here: PyTorch takes seconds to load
+    import stable_baselines3  # imported here, as PyTorch takes seconds to load
 
     from mptc_gym.sb3 import load
 

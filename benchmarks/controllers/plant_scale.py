@@ -1,4 +1,4 @@
-"""Compare plants in what the gains of a controller depend on, and scale gains by that."""
+"""Compare the magnitudes of plants, and scale the gains of controllers between plants."""
 
 import math
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
 
-MUCH = 2.0  # Two plants are different if a number of theirs differs by more than this factor.
+MUCH = 2.0  # Two plants differ if one of their magnitudes differs by more than this factor.
 PAPER = Parameters()
 # The intervals in which a search on the paper's plant looks for each gain.
 PI_SPANS = {"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}
@@ -52,7 +52,7 @@ def scales(plant: Parameters) -> dict[str, float]:
 def difference(plant: Parameters, made_for: Parameters) -> str:
     """Return in words which magnitudes of two plants differ by a factor of more than `MUCH`.
 
-    The text is "" if none does.
+    The text is "" if no magnitude does.
     """
     expected = scales(made_for)
     parts = []

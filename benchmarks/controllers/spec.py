@@ -182,8 +182,8 @@ class ControllerSpec:
     def robust_time_constant(self, plant: Mapping[str, Any]) -> float:
         """Return the value of the argument `tuned_by` with which Ms is `sensitivity`, s.
 
-        `plant` has the environment's arguments. The value has four digits, so that it is the
-        same on all machines.
+        `plant` has the environment's arguments. The time constant is rounded to four digits, so
+        that it is the same on all machines.
         """
         parameters = Parameters(**plant)
         arguments = knowledge(self.prior_knowledge, parameters, 1, 0)

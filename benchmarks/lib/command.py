@@ -304,7 +304,7 @@ class FanOut:
 
     def _answers(self, tasks: Mapping[str, Task]) -> Iterator[Answer]:
         """Run tasks, and yield their answers in the order in which they come."""
-        import joblib  # here: slow to import
+        import joblib  # imported here, as it is slow to import
 
         calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
         if self.backend == "ray":
@@ -321,7 +321,7 @@ class FanOut:
         ):
             parallel = joblib.Parallel(jobs, return_as="generator_unordered", batch_size=1)
         try:
-            with _ctrl_c_ignored():  # also by the processes that are started here
+            with _ctrl_c_ignored():  # The processes that start here ignore Ctrl-C, too.
                 answers = parallel(calls)
             yield from answers
         except BrokenProcessPool as error:
@@ -400,7 +400,7 @@ def _connect_to_ray() -> None:
 
     Ray copies the checkout to its nodes. A `UsageError` is raised if no cluster can be reached.
     """
-    import ray  # here: an optional package that takes a second to import
+    import ray  # imported here, as it is optional and slow to import
     from ray.util.joblib import register_ray
 
     register_ray()

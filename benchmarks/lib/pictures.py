@@ -70,7 +70,7 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
     title : str
         A sentence, which is broken into lines.
     """
-    from matplotlib import rc_context  # here: slow to import, and not for all reports
+    from matplotlib import rc_context  # imported here, as it is slow
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from PIL import Image
@@ -117,7 +117,7 @@ class Panels:
     def add_legend(self, entries: Mapping[str, Artist], columns: int) -> None:
         """Put a legend in the unused places of the last row, or else below all panels.
 
-        `entries` holds an artist for each text. A legend below has `columns` columns.
+        `entries` has an artist for each text. A legend below the panels has `columns` columns.
         """
         handles = list(entries.values())
         texts = list(entries)

@@ -33,7 +33,7 @@ def origin() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that affect a result."""
-    import mptc_gym  # here: Gymnasium and NumPy are slow to import
+    import mptc_gym  # imported here, as Gymnasium is slow to import
 
     installed = {"python": platform.python_version(), "mptc_gym": mptc_gym.__version__}
     for package in PACKAGES:

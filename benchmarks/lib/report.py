@@ -131,8 +131,8 @@ def _print(section: Section) -> None:
 def on_screen(table: pd.DataFrame) -> str:
     """Return a table of texts as lines that are no wider than the terminal.
 
-    Nothing is cut off: columns that do not fit beside the others follow below them, again
-    beside the first column.
+    If the columns do not fit on a line, the table is broken into blocks below each other, which
+    all begin with the first column.
     """
     width = shutil.get_terminal_size((150, 24)).columns
     first = table.columns[0]

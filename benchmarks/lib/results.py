@@ -79,7 +79,7 @@ def _lock(place: Path) -> AbstractContextManager[object]:
     The system frees the lock if this process is killed. A `UsageError` is raised if another run
     holds the lock.
     """
-    from filelock import FileLock, Timeout  # here: the help of a command does without it
+    from filelock import FileLock, Timeout  # imported here, as --help needs no lock
 
     try:
         return FileLock(place.with_name(f".{place.name}.lock")).acquire(timeout=0)
@@ -162,8 +162,8 @@ def _finish(unfinished: Path, place: Path) -> None:
 def conditions_of(command: str, options: Any) -> dict[str, Any]:
     """Return all that the results of a command depend on, JSON-serialisable.
 
-    These are its options, the code and the versions of packages. `options` is the dataclass of
-    options. The content of a file among them counts, not its name.
+    Results depend on the options, on the code and on the versions of packages. `options` is the
+    dataclass of options. If an option is a file, its content counts, not its name.
     """
     conditions = {
         "command": command,
@@ -187,7 +187,7 @@ def _relevant(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _content(value: object) -> str:
-    """Return a hash of the content if the value is the path of a file, else it as text."""
+    """Return a hash of the content of a file, given its path, and another value as text."""
     if isinstance(value, Path) and value.is_file():
         return hashlib.sha256(value.read_bytes()).hexdigest()
     return str(value)

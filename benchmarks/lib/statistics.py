@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy  # loads its modules on first use
+import scipy  # SciPy loads its modules on first use.
 from numpy.typing import ArrayLike, NDArray
 
 ENDS = 0.025, 0.975  # quantiles at the ends of a 95 % interval, as in SciPy
@@ -128,7 +128,7 @@ def percentiles(
     Parameters
     ----------
     values
-        The values.
+        Values, shape (..., runs).
     method
         The method of `numpy.percentile`. If some values are infinite, such as the time of a run
         that never settles, the method is "higher", since these cannot be interpolated.
