@@ -10,7 +10,9 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
+import joblib
 import numpy as np
 import pytest
 
@@ -124,6 +126,14 @@ def test_tasks_can_be_run_from_a_thread():
     with ThreadPoolExecutor() as threads:
         results = threads.submit(run, work(3)).result()
     assert results == {f"plant {seed}": draw(seed) for seed in range(3)}
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_error_of_joblib_leaves_the_signals_as_they_were(monkeypatch):
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(joblib.Parallel, "__call__", Mock(side_effect=OSError("no semaphores")))
+    with pytest.raises(OSError, match="no semaphores"):
+        run(work(3))
     assert signal.getsignal(signal.SIGINT) is before
 
 
