@@ -57,8 +57,8 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
         raise UsageError(f"--out: {target} is the root of a file system: choose a folder in it")
     out_folder(place.parent)
     unfinished = place.with_name(f"{place.name}.unfinished")
+    _refuse_other_files(place)
     with _lock(place):
-        _refuse_other_files(place)
         _prepare(unfinished, conditions)
         try:
             yield unfinished
