@@ -250,9 +250,10 @@ class Answer(NamedTuple):
 @options
 @dataclass(frozen=True, kw_only=True)
 class FanOut:
-    """Where joblib runs tasks, and how many at once. One job runs in this process.
+    """Where joblib runs tasks, and how many run at once. A single job runs in this process.
 
-    A result depends on neither, as long as all randomness of a task comes from its arguments.
+    The result of a task does not depend on these options, as long as all randomness of the task
+    comes from its arguments.
     """
 
     jobs: Count | None = None
@@ -274,12 +275,13 @@ class FanOut:
             Title of the progress bar; "" for no progress bar.
         store
             Results of an earlier run of the same tasks, which are yielded first. New results
-            are added to it.
+            are added to the store.
 
         Raises
         ------
         UnfinishedError
-            At the end, if tasks failed. It names them and their errors.
+            If tasks failed, after all other tasks have finished. The message names the failed
+            tasks and their errors.
         """
         missing: dict[str, Task] = {}
         errors: dict[str, str] = {}

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 COLOURS = "#0072B2", "#D55E00"  # of lines that stand for no controller
 WIDTH = 7.5  # of a picture, inches
-TITLE_CHARACTERS = 90  # that fit on a line of a title
+TITLE_CHARACTERS = 90  # on a line of a title
 PALETTE = 128  # colours of a saved picture; fewer make the file smaller
 STYLE: Any = {
     "axes.grid": True,
@@ -81,7 +81,7 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         figure.suptitle(sentence, x=0.015, ha="left", fontsize=10, weight="bold")
         yield figure
         canvas: Any = FigureCanvasAgg(figure)
-        canvas.draw()  # once; `Figure.savefig` would draw twice because of the layout
+        canvas.draw()  # `Figure.savefig` would draw twice because of the layout.
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     picture.quantize(PALETTE, Image.Quantize.FASTOCTREE).save(path)
 

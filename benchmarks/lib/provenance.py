@@ -48,7 +48,7 @@ def commit() -> str:
 
     The result is "" without git, and if the checkout is not a repository.
     """
-    if not (ROOT / ".git").exists():  # git would find a repository around the checkout.
+    if not (ROOT / ".git").exists():  # git would look for a repository around it.
         return ""
     command = ["git", "status", "--porcelain=v2", "--branch"]
     try:

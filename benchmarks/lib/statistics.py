@@ -67,9 +67,9 @@ def student(values: ArrayLike) -> Estimate:
 def quantile(values: ArrayLike, probability: float) -> Estimate:
     """Estimate a quantile of values, one a run.
 
-    The interval is that of `scipy.stats.quantile_test`. Its ends are two of the ordered values,
-    or infinite if there are too few runs. The interval assumes nothing about the distribution
-    of the values.
+    The interval is that of `scipy.stats.quantile_test`. The ends of the interval are two of the
+    ordered values, or infinite if there are too few runs. The interval assumes nothing about
+    the distribution of the values.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     value = percentiles(ordered, value=100.0 * probability)["value"]
