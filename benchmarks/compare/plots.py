@@ -48,16 +48,17 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
     """
     marks = marks_of(list(scores))
     drawn = [score.value for score in scores.values()]
-    with open_picture(path, 1.3 + 0.3 * len(scores), scores_finding(scores)) as figure:
+    height = 1.3 + 0.3 * len(scores)  # inches: title and axis, and the rows
+    with open_picture(path, height, scores_finding(scores)) as figure:
         axes = figure.subplots()
         for row, (agent, score) in enumerate(scores.items()):
             mark = marks[agent]
             scores_of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
             scenario_scores = [float(np.mean(values)) for values in scores_of_runs]
             drawn += scenario_scores
-            height = np.full(len(scenario_scores), row)
+            rows = np.full(len(scenario_scores), row)
             ticks: Any = {"color": mark["color"], "marker": "|", "ms": 9, "mew": 1.4, "ls": ""}
-            axes.plot(distance(scenario_scores), height, **ticks)
+            axes.plot(distance(scenario_scores), rows, **ticks)
             axes.plot(distance(score.value), row, **mark)
             place = (1.01, row)  # to the right of the axes
             text = written(score.value, ".3f")
@@ -138,14 +139,15 @@ def plot_responses(
     agents = errors[responses["agent"].unique()].sort_values(kind="stable").index
     styles = looks([*agents])
     title = f"{scenario.title}: {responses_finding(errors[agents])}"
-    with open_picture(path, 1.2 + 1.25 * len(agents), title) as figure:
+    height = 1.2 + 1.25 * len(agents)  # inches: title and legend, and the rows
+    with open_picture(path, height, title) as figure:
         grid = figure.subplots(len(agents), 2, sharex=True, sharey="col", squeeze=False)
-        for (left, right), agent in zip(grid, agents, strict=True):
+        for (temperature_axes, flow_axes), agent in zip(grid, agents, strict=True):
             rows = responses[responses["agent"] == agent]
             colour, _ = styles[agent]
-            left.set_title(f"{label(agent)}: mean error {errors[agent]:.3f} °C")
-            _draw_temperature(left, rows, colour)
-            _draw_flow(right, rows, colour, scenario.parameters)
+            temperature_axes.set_title(f"{label(agent)}: mean error {errors[agent]:.3f} °C")
+            _draw_temperature(temperature_axes, rows, colour)
+            _draw_flow(flow_axes, rows, colour, scenario.parameters)
         for axes in grid[-1]:
             axes.set_xlabel("time (min)")
             axes.set_xlim(0.0, responses["time_s"].max() / 60.0)
