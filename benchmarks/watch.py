@@ -1,17 +1,26 @@
 """Make a film of a controller at work: `python -m benchmarks.watch --help`."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from benchmarks.controllers.options import agent_names, chosen
-from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Seed, command, known, options
 from benchmarks.lib.errors import UsageError
 from benchmarks.lib.storage import file_name, out_folder
+from benchmarks.loop.rollout import Trajectory, drawn_numbers, mean_error
 from benchmarks.loop.scenarios import SCENARIOS, PlantOptions
-from benchmarks.plots.film import make_film, write_film
+from mptc_gym import Parameters
+from mptc_gym.parameters import PlantNumbers
 
-REFERENCE = ROSTER["neural-smith"]  # the controller that others are compared with
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+SAMPLES_PER_FRAME = 20
+DURATION = 100  # ms for which a frame is shown
+LAST_DURATION = 2000  # ms for which the last frame is shown
+COLOURS = 24  # in the file; few colours make the file small
 
 
 @options
@@ -20,36 +29,83 @@ class Options:
     """Make a film of a controller at work."""
 
     agent: str = "nn"
-    """Who controls: a name as in `compare`, or your own, NAME=MODULE:FACTORY."""
+    """The controller: a name as in `compare`, or your own controller, NAME=MODULE:FACTORY."""
     scenario: str | None = None
-    """Case to run, as in `compare`; on a plant of your own: square, constant, run (default:
-    the first)."""
+    """The case to run, as in `compare`. On a plant of your own, the cases are square and
+    constant, or run if the plant has a set point (default: the first case)."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     seed: Seed = 0
-    """Seed of noise and initial weights."""
+    """The seed of noise and initial weights."""
     video: Path | None = None
-    """The film, a .gif file (default: in results/watch)."""
+    """The file of the film, which ends in .gif (default: a file in results/watch)."""
 
 
 def work(options: Options) -> str:
-    """Run a controller on a case and write a film of it."""
+    """Run a controller on a case and write a film of the run."""
     cases = options.plant.cases(SCENARIOS)
-    case = cases[known("--scenario", [options.scenario or next(iter(cases))], cases)[0]]
-    names: list[str] = []
-    factories: list[str] = []
+    wanted = options.scenario or next(iter(cases))
+    known("--scenario", [wanted], cases)
+    case = cases[wanted]
     if "=" in options.agent:
-        factories = [options.agent]
+        (controller,) = chosen([], [options.agent]).values()
     else:
-        names = agent_names("--agent", [options.agent])
-    (controller,) = chosen(names, factories).values()
-    name = f"{file_name(controller.name)}-{case.name}.gif"
-    path = options.video or Path("results/watch", name)
+        (controller,) = chosen(agent_names("--agent", [options.agent])).values()
+    default_path = Path("results/watch", f"{file_name(controller.name)}-{case.name}.gif")
+    path = options.video or default_path
     if path.suffix != ".gif":
-        raise UsageError(f"--video: must end in .gif, got {path}")
+        raise UsageError(f"--video: the file must end in .gif, got {path}")
     out_folder(path.absolute().parent, "--video")
-    film = make_film(case, controller, REFERENCE, options.seed)
-    write_film(path, film)
-    return f"On {case.title}:\n{film.finding}.\nThe film is {path}"
+    first_member = controller.members()[0]
+    trajectory = first_member.run(case.arguments, case.samples, 1, options.seed)
+    write_film(path, trajectory, case.parameters, options.seed)
+    error = mean_error(trajectory)[0]
+    return (
+        f"On {case.title}, the mean error of {controller.label} is {error:.3f} °C.\n"
+        f"The film is {path}"
+    )
+
+
+def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed: int) -> None:
+    """Write a film of a run as a GIF file.
+
+    `parameters` are the arguments of the environment, and `seed` is the seed of the run.
+    """
+    from PIL.Image import Dither, Quantize
+
+    pictures = list(frames(trajectory, parameters, seed))
+    palette = pictures[-1].quantize(COLOURS, Quantize.MAXCOVERAGE, kmeans=3)
+    first, *rest = [
+        picture.quantize(palette=palette, dither=Dither.NONE) for picture in pictures
+    ]
+    durations = [DURATION] * len(rest) + [LAST_DURATION]
+    first.save(path, save_all=True, append_images=rest, duration=durations, loop=0)
+
+
+def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterator[Image]":
+    """Yield the pictures that the environment draws in the first run of a trajectory.
+
+    There is a picture after every `SAMPLES_PER_FRAME` samples. `parameters` are the arguments
+    of the environment, and `seed` is the seed of the run.
+    """
+    from PIL import Image
+
+    from mptc_gym.drawing import frame  # imported here, as it needs pygame
+    from mptc_gym.record import Record
+
+    drawn = drawn_numbers(parameters, 1, seed)
+    numbers = {name: float(values[0]) for name, values in vars(drawn).items()}
+    initial_setpoint = float(trajectory.setpoint[0, 0])
+    record = Record(PlantNumbers(**numbers), parameters.sampling_interval, initial_setpoint)
+    next_outputs = trajectory.next_setpoint - trajectory.next_error
+    for k in range(len(trajectory.setpoint)):
+        record.add(
+            setpoint=float(trajectory.next_setpoint[k, 0]),
+            output=float(next_outputs[k, 0]),
+            command=float(trajectory.command[k, 0]),
+            applied=float(trajectory.applied[k, 0]),
+        )
+        if record.k % SAMPLES_PER_FRAME == 0:
+            yield Image.fromarray(frame(record))
 
 
 main = command("watch", Options, work)

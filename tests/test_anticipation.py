@@ -11,7 +11,8 @@ from benchmarks.compare.anticipation import (
     movement_before_changes,
     surprising_setpoint,
 )
-from benchmarks.compare.comparison import estimate, ranked, ratio_table, run_case, scale_of
+from benchmarks.compare.comparison import estimate, ranked, run_case, scale_of
+from benchmarks.compare.report import ratio_table
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.controllers.spec import LIMITS, ControllerSpec
 from benchmarks.loop.linear import nominal

@@ -229,8 +229,8 @@ class TestSavedPolicies:
             ("No:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("SAC:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("PPO:{}/nan.zip", "Expected parameter loc"),
-            ("{}/velocity.zip", "must be NEW_NAME=.* that is there"),
-            ("PPO:{}/none.zip", "must be NEW_NAME=.* that is there"),
+            ("{}/velocity.zip", "must be NEW_NAME=.* that exists"),
+            ("PPO:{}/none.zip", "must be NEW_NAME=.* that exists"),
         ],
     )
     def test_what_is_refused(self, location, complaint, zips):

@@ -74,7 +74,9 @@ def test_an_exception_names_its_task_and_spares_the_others(jobs):
 
 
 def test_a_killed_process_is_a_sentence():
-    with pytest.raises(UnfinishedError, match="killed, perhaps for lack of memory: try fewer"):
+    with pytest.raises(
+        UnfinishedError, match="killed, perhaps because memory ran out: try fewer"
+    ):
         run({**work(2), "the killer": die_of_memory})
     assert run(work(2))  # with new processes
 

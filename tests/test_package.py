@@ -60,8 +60,7 @@ EXAMPLES = [
 
 
 COMPARE = {  # the extra
-    "cyclopts", "filelock", "joblib", "markdown", "matplotlib", "pandas", "rich", "scipy",
-    "tabulate",
+    "cyclopts", "filelock", "joblib", "matplotlib", "pandas", "rich", "scipy", "tabulate",
 }  # fmt: skip
 
 

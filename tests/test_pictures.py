@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.compare import plots
 from benchmarks.controllers.roster import looks
-from benchmarks.lib.pictures import STYLE, open_picture, scale_by_ratio
+from benchmarks.lib.pictures import STYLE, scale_by_ratio
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
 from benchmarks.plots import sweep
@@ -30,20 +30,6 @@ class TestFindings:
             "PI (1992) scores lowest with 0.000"
         )
         assert plots.scores_finding({"mine": estimates["mine"]}) == "mine scores 0.900"
-
-    def test_of_travel(self):
-        rows = [
-            # scenario, agent, error, travel: in "a", Smith's error is 6 % above the smallest.
-            ("a", "smith", 1.06, 10.0), ("a", "pi", 1.04, 20.0), ("a", "mpc", 1.0, 30.0),
-            ("b", "smith", 1.04, 10.0), ("b", "pi", 1.00, 20.0), ("b", "mpc", 2.0, 1.0),
-            ("c", "smith", 3.00, 10.0), ("c", "pi", 1.00, 20.0), ("c", "mpc", 2.0, 1.0),
-        ]  # fmt: skip
-        means = pd.DataFrame(rows, columns=["scenario", "agent", "mae", "travel"])
-        finding = plots.travel_finding(means)
-        assert finding.endswith("PI (1992) moves the valve least in 2 of 3 cases")
-        assert "within 5 % of the smallest" in finding
-        alone = plots.travel_finding(means[means["agent"] == "pi"])
-        assert alone == "Mean error and valve travel of PI (1992)"
 
     def test_of_responses(self):
         errors = pd.Series({"mpc": 0.5, "nn": 1.0, "pi": 1.27})
@@ -183,16 +169,3 @@ def test_any_sweep_can_be_drawn(columns, tmp_path):
         path = tmp_path / "map.png"
         sweep.draw(shown, path, Parameters())
         assert path.stat().st_size > 1000
-
-
-def test_a_picture_that_fails_leaves_the_old_one(tmp_path):
-    path = tmp_path / "picture.png"
-    path.write_text("old")
-
-    def fail():
-        with open_picture(path, 2.0, "a title"):
-            raise ArithmeticError
-
-    with pytest.raises(ArithmeticError):
-        fail()
-    assert path.read_text() == "old"

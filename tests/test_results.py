@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.lib import provenance, results
+from benchmarks.lib import provenance
 from benchmarks.lib.command import FanOut
 from benchmarks.lib.errors import UnfinishedError, UsageError
 from benchmarks.lib.results import KeptResults, conditions_of, results_folder
@@ -59,7 +59,7 @@ class TestFolder:
             run(target, {"report.md": "half"}, error=error())
         assert contents(target) == {"report.md": "old", "old.csv": "1"}
         assert contents(unfinished(target)) == {"report.md": "half"}
-        assert f"what has finished is in {unfinished(target)}/." in capsys.readouterr().out
+        assert f"results so far are in {unfinished(target)}/." in capsys.readouterr().out
         run(target, {"new.csv": "2"})  # which begins anew
         assert contents(target) == {"new.csv": "2"}
         assert not unfinished(target).exists()
@@ -100,29 +100,9 @@ class TestFolder:
         with pytest.raises(UsageError, match="holds files that no run wrote: remove it"):
             run(target, {})
 
-    def test_a_run_that_is_killed_while_results_are_exchanged_loses_none(
-        self, target, monkeypatch
-    ):
-        rename = Path.rename
-
-        def rename_until_killed(path, to):
-            if path == unfinished(target):
-                raise KeyboardInterrupt
-            return rename(path, to)
-
-        monkeypatch.setattr(Path, "rename", rename_until_killed)
-        monkeypatch.setattr(results, "_restore", lambda _: None)  # as if there were no time
-        with pytest.raises(KeyboardInterrupt):
-            run(target, {"report.md": "new"})
-        assert not target.exists()
-        monkeypatch.undo()
-        with pytest.raises(ArithmeticError):
-            run(target, {}, error=ArithmeticError())
-        assert contents(target) == {"report.md": "old", "old.csv": "1"}
-
     @pytest.mark.parametrize(
         ("folder", "reason"),
-        [("/proc/here/toy", "/proc/here cannot be"), ("/", "/ is no folder")],
+        [("/proc/here/toy", "/proc/here cannot be"), ("/", "/ is the root")],
     )
     def test_a_folder_that_cannot_be_written_to_is_refused(self, folder, reason):
         with pytest.raises(UsageError, match=f"--out: {reason}"):
@@ -136,11 +116,10 @@ class TestUnfinished:
 
     def test_the_same_run_goes_on_and_ends_with_the_files_of_both(self, target, capsys):
         self.stop(target, CONDITIONS)
-        assert "; the same command goes on from there." in capsys.readouterr().out
+        assert "The same command continues with them." in capsys.readouterr().out
         (unfinished(target) / "tasks").mkdir()
-        (unfinished(target) / ".123.partial.csv").touch()  # of a process that was killed
         run(target, {"report.md": "new"}, CONDITIONS)
-        assert "goes on from what has finished in" in capsys.readouterr().out
+        assert "The run continues with the results in" in capsys.readouterr().out
         assert contents(target) == {"half.csv": "1", "report.md": "new"}
 
     @pytest.mark.parametrize("conditions", [None, {"options": {"runs": 4}}])
@@ -148,7 +127,7 @@ class TestUnfinished:
         self.stop(target, CONDITIONS)
         run(target, {"report.md": "new"}, conditions)
         assert contents(target) == {"report.md": "new"}
-        said = "is of other options, code or packages: the run begins anew."
+        said = "are of other options, code or packages."
         assert (said in capsys.readouterr().out) == (conditions is not None)
 
     def test_options_count_but_not_where_tasks_run(self, tmp_path):
@@ -233,7 +212,7 @@ class TestKeptResults:
             return {"number": 0.1}
 
         for _ in range(2):
-            done = dict(FanOut(jobs=1).stream({"a": task, "b": task}, kept=kept))
+            done = dict(FanOut(jobs=1).stream({"a": task, "b": task}, store=kept))
             assert done == {"a": {"number": 0.1}, "b": {"number": 0.1}}
         assert len(calls) == 2
 

@@ -1,6 +1,5 @@
 """Compare controllers in the same noise: `python -m benchmarks.compare --help`."""
 
-import itertools
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -8,16 +7,7 @@ from typing import Annotated, Any
 
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import (
-    Folder,
-    Names,
-    Parameter,
-    Runs,
-    Seed,
-    command,
-    known,
-    options,
-)
+from benchmarks.lib.command import Folder, Names, Parameter, Runs, Seed, command, known, options
 from benchmarks.lib.errors import UsageError
 from benchmarks.lib.provenance import origin
 from benchmarks.lib.results import results_folder
@@ -31,13 +21,15 @@ from benchmarks.loop.scenarios import (
 )
 from mptc_gym.evaluation import SEED
 
-_CASES = (
-    f"Cases to run (default: all). Of the paper: {', '.join(SCENARIOS)}. With --presets: "
-    f"{', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set: "
-    f"{', '.join(setpoint.name for setpoint in SETPOINTS)}."
+_SCENARIOS_HELP = (
+    f"The cases to run (default: all). The cases of the paper are {', '.join(SCENARIOS)}. With "
+    f"--presets, the cases are {', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set, "
+    f"the cases are {', '.join(setpoint.name for setpoint in SETPOINTS)}."
 )
-
-_OUT = "Folder (default: results/compare; compare-presets or compare-plant for other cases)."
+_OUT_HELP = (
+    "The folder to write to (default: results/compare; results/compare-presets with --presets; "
+    "results/compare-plant with --plant, --preset or --set)."
+)
 
 
 @options
@@ -45,75 +37,80 @@ _OUT = "Folder (default: results/compare; compare-presets or compare-plant for o
 class Options:
     """Run controllers on the same cases in the same noise, and write a report."""
 
-    agents: AgentNames = tuple(name for name, each in ROSTER.items() if each.compared)
+    agents: AgentNames = tuple(name for name, spec in ROSTER.items() if spec.compared)
     controllers: ControllerOptions = field(default_factory=ControllerOptions)
-    scenarios: Annotated[Names | None, Parameter(help=_CASES)] = None
+    scenarios: Annotated[Names | None, Parameter(help=_SCENARIOS_HELP)] = None
     plant: PlantOptions = field(default_factory=PlantOptions)
     presets: bool = False
-    """Run the environment's presets instead of the paper's cases."""
+    """Run the presets of the environment instead of the cases of the paper."""
     runs: Runs = 100
-    """Runs of each controller in each case."""
+    """The number of runs of each controller in each case."""
     seed: Seed = SEED
-    """Seed of the first run (default: that of the published episodes)."""
-    out: Annotated[Folder | None, Parameter(help=_OUT)] = None
+    """The seed of the first run (default: the seed of the first published episode)."""
+    out: Annotated[Folder | None, Parameter(help=_OUT_HELP)] = None
 
 
 def work(options: Options) -> str:
-    """Run the comparison and write its results, also after an error: of what has finished."""
-    from benchmarks.compare.comparison import run_case, scale_of, write
+    """Run the comparison and write its results; write finished results after an error, too."""
+    from benchmarks.compare.comparison import run_case, scale_of
+    from benchmarks.compare.report import write
 
     controllers = chosen(options.agents, options.controllers.agent)
-    fan_out = options.controllers.fan_out
-    name_of_cases, scenarios = cases(options)
-    target, made = options.out or Path("results", name_of_cases), origin()
-    runs, seed = options.runs, options.seed
-    bounds = {
-        f"bounds of {scenario.name}": partial(scale_of, scenario, runs, seed)
-        for scenario in scenarios
-    }
-    cells = {
-        f"{name}, {scenario.name}": partial(run_case, scenario, controller, runs, seed)
-        for (name, controller), scenario in itertools.product(controllers.items(), scenarios)
-    }
-    # Short tasks last, so that no core waits long at the end.
-    tasks = dict(sorted((bounds | cells).items(), key=lambda task: -task[1].args[0].samples))
-    found: dict[str, Any] = {}
+    folder_name, scenarios = cases(options)
+    target = options.out or Path("results", folder_name)
+    provenance = origin()
+    bounds: dict[str, Any] = {}
+    cells: dict[str, Any] = {}
+    for scenario in scenarios:
+        bound = partial(scale_of, scenario, options.runs, options.seed)
+        bounds[f"bounds of {scenario.name}"] = bound
+    for name, controller in controllers.items():
+        for scenario in scenarios:
+            cell = partial(run_case, scenario, controller, options.runs, options.seed)
+            cells[f"{name}, {scenario.name}"] = cell
+    tasks = bounds | cells
+    # Long tasks start first, so that no core waits long at the end.
+    names = sorted(tasks, key=lambda name: -tasks[name].args[0].samples)
+    sorted_tasks = {name: tasks[name] for name in names}
+    done: dict[str, Any] = {}
     with results_folder(target) as folder:
         try:
-            found.update(fan_out.stream(tasks, "compare"))
+            done.update(options.controllers.fan_out.stream(sorted_tasks, "compare"))
         finally:
-            if missing := len(tasks) - len(found):
-                made["missing"] = f"{missing} of {len(tasks)} tasks are missing"
-            if finished := [found[name] for name in cells if name in found]:
-                provenance = made | {
-                    "options": {**asdict(options), "agents": [*controllers]},
-                    "seeds": [*range(seed, seed + runs)],
+            missing = len(tasks) - len(done)
+            if missing:
+                provenance["missing"] = f"{missing} of {len(tasks)} tasks are missing"
+            results = [done[name] for name in cells if name in done]
+            scales = [done[name] for name in bounds if name in done]
+            if results:
+                policies = {result.agent: result.policies for result in results}
+                content = {
+                    **provenance,
+                    "options": {**asdict(options), "agents": list(controllers)},
+                    "seeds": list(range(options.seed, options.seed + options.runs)),
                     "scenarios": {scenario.name: vars(scenario) for scenario in scenarios},
-                    "policies": {
-                        case.agent: case.policies for case in finished if case.policies
-                    },
+                    "policies": {name: policies[name] for name in policies if policies[name]},
                 }
-                write_json(folder / "provenance.json", provenance)
-                scales = [found[name] for name in bounds if name in found]
-                write(finished, scales, controllers, folder, made)
+                write_json(folder / "provenance.json", content)
+                write(results, scales, controllers, folder, provenance)
     return f"The report, tables, data and plots are in {target}/"
 
 
 def cases(options: Options) -> tuple[str, list[Scenario]]:
-    """Return the name of the cases that the options ask for, a folder's, and these cases."""
+    """Return the name of the default folder, and the scenarios that the options ask for."""
     if options.presets and options.plant.name:
         raise UsageError("--presets cannot be combined with --plant, --preset and --set")
     if options.presets:
-        name, available = "compare-presets", PRESET_SCENARIOS
+        folder_name, available = "compare-presets", PRESET_SCENARIOS
     elif options.plant.name:
-        name, available = "compare-plant", dict(options.plant.cases(SCENARIOS))
+        folder_name, available = "compare-plant", dict(options.plant.cases(SCENARIOS))
     else:
-        name, available = "compare", SCENARIOS
-    wanted = [*available] if options.scenarios is None else options.scenarios
-    scenarios = [available[wish] for wish in known("--scenarios", wanted, available)]
+        folder_name, available = "compare", SCENARIOS
+    wanted = list(available) if options.scenarios is None else options.scenarios
+    scenarios = [available[name] for name in known("--scenarios", wanted, available)]
     if not scenarios:
-        raise UsageError("--scenarios: none to run")
-    return name, scenarios
+        raise UsageError("--scenarios: name at least one case")
+    return folder_name, scenarios
 
 
 main = command("compare", Options, work)

@@ -1,7 +1,4 @@
-"""Draw the pictures of a comparison from the tables that it writes.
-
-The title of each picture states what its data show.
-"""
+"""Draw the pictures of a comparison; the title of a picture states what its data show."""
 
 from __future__ import annotations
 
@@ -11,30 +8,19 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import NullLocator
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.controllers.roster import label, looks
-from benchmarks.lib.pictures import (
-    DEAD_ZONE,
-    LIMIT,
-    RATIO_LABEL,
-    SETPOINT,
-    excess,
-    open_panels,
-    open_picture,
-    percent,
-    scale_by_ratio,
-)
+from benchmarks.lib.pictures import DEAD_ZONE, LIMIT, SETPOINT, open_picture
 from benchmarks.lib.statistics import Estimate, written
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 
-# Scores between which the axis of scores reaches. Others are drawn at its ends.
+# The ends of the axis of scores. Scores beyond an end are drawn at the end.
 LOWEST_SCORE = -0.5
 HIGHEST_SCORE = 0.999
 SCORE_TICKS = LOWEST_SCORE, 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, HIGHEST_SCORE
@@ -42,42 +28,44 @@ SCORE_LABEL = (
     "score: 0 = idle valve, 1 = lowest achievable error (axis logarithmic in 1 minus the score)"
 )
 
-BAND: Any = {"alpha": 0.3, "linewidth": 0}  # how the range of most runs is drawn
+BAND: Any = {"alpha": 0.3, "linewidth": 0}  # the 10th to 90th percentile of the runs
 
-MARKER_SIZES = {"*": 8.0, "D": 5.0}  # points, so that they look as large as others of 6 points
-NEARLY_BEST = 1.05  # An error counts as nearly the smallest of a case up to this multiple.
+MARKER_SIZE = 6.0  # points
+MARKER_SIZES = {"*": 8.0, "D": 5.0}  # points; these markers then look as large as the others
 
 
 def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: Path) -> None:
-    """Draw the score of each controller, in the given order, and its score in each case.
+    """Draw the overall score of each controller in a row, and its score in each scenario.
 
     Parameters
     ----------
     scores : mapping
-        The mean score over all cases for each controller, the best first.
+        The overall score of each controller, the best first.
     estimates : pandas.DataFrame
-        A row for each case and controller, as `comparison.estimate` returns it.
+        A row for each scenario and controller, as `comparison.estimate` returns it.
     path : Path
         The PNG file.
     """
-    marks = marks_of([*scores])
-    shown = [score.value for score in scores.values()]
-    with open_picture(path, 1.3 + 0.3 * len(scores), scores_finding(scores)) as figure:
+    marks = marks_of(list(scores))
+    drawn = [score.value for score in scores.values()]
+    height = 1.3 + 0.3 * len(scores)  # inches: title and axis, and the rows
+    with open_picture(path, height, scores_finding(scores)) as figure:
         axes = figure.subplots()
         for row, (agent, score) in enumerate(scores.items()):
             mark = marks[agent]
-            of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
-            cases = [float(np.mean(values)) for values in of_runs]
-            shown += cases
-            height = np.full(len(cases), row)
-            axes.plot(distance(cases), height, "|", color=mark["color"], ms=9, mew=1.4)
+            scores_of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
+            scenario_scores = [float(np.mean(values)) for values in scores_of_runs]
+            drawn += scenario_scores
+            rows = np.full(len(scenario_scores), row)
+            ticks: Any = {"color": mark["color"], "marker": "|", "ms": 9, "mew": 1.4, "ls": ""}
+            axes.plot(distance(scenario_scores), rows, **ticks)
             axes.plot(distance(score.value), row, **mark)
-            place = (1.01, row)  # right of the axes
+            place = (1.01, row)  # to the right of the axes
             text = written(score.value, ".3f")
             axes.annotate(text, place, xycoords=("axes fraction", "data"), va="center")
         axes.set_yticks(range(len(scores)), [label(agent) for agent in scores])
         axes.set_ylim(len(scores) - 0.5, -0.5)
-        _scale_by_score(axes, shown)
+        _scale_by_score(axes, drawn)
         caption = SCORE_LABEL
         if estimates["scenario"].nunique() > 1:
             caption += "\nlarge marker and number: mean over the cases; small tick: one case"
@@ -85,7 +73,10 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
 
 
 def scores_finding(scores: Mapping[str, Estimate]) -> str:
-    """Return a sentence that says who scores highest and lowest."""
+    """Return a sentence that names the controllers with the highest and lowest scores.
+
+    `scores` are the scores of the controllers, the highest first.
+    """
     names = [label(agent) for agent in scores]
     values = [written(score.value, ".3f") for score in scores.values()]
     first = f"{names[0]} scores highest with {values[0]}"
@@ -98,27 +89,30 @@ def scores_finding(scores: Mapping[str, Estimate]) -> str:
 
 
 def marks_of(agents: Sequence[str]) -> dict[str, Any]:
-    """Return how the marker of each controller is drawn: arguments of `Axes.plot`."""
+    """Return the arguments of `Axes.plot` that draw the marker of each controller."""
     marks = {}
     for agent, (colour, marker) in looks(agents).items():
-        size = MARKER_SIZES.get(marker, 6.0)
+        size = MARKER_SIZES.get(marker, MARKER_SIZE)
         marks[agent] = {"color": colour, "marker": marker, "ms": size, "linestyle": ""}
     return marks
 
 
 def distance(scores: ArrayLike) -> NDArray[np.float64]:
-    """Return 1 minus each score, of scores moved to the nearest end of the axis."""
+    """Return 1 minus each score. A score beyond the axis is first moved to its end."""
     return 1.0 - np.clip(scores, LOWEST_SCORE, HIGHEST_SCORE)
 
 
-def _scale_by_score(axes: Axes, shown: Sequence[float]) -> None:
-    """Make the x axis, of `distance(scores)`, logarithmic, with scores as its ticks."""
+def _scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
+    """Make the x axis of `distance(scores)` logarithmic, and label its ticks by scores.
+
+    `scores` are all scores that are drawn.
+    """
     labels = [f"{score:g}" for score in SCORE_TICKS]
-    if min(shown) < LOWEST_SCORE:
+    if min(scores) < LOWEST_SCORE:
         labels[0] = f"< {labels[0]}"
-    if max(shown) > HIGHEST_SCORE:
+    if max(scores) > HIGHEST_SCORE:
         labels[-1] = f"> {labels[-1]}"
-    start = 1.15 * float(distance(min(0.0, *shown)))
+    start = 1.15 * float(distance(min(0.0, *scores)))
     end = float(distance(HIGHEST_SCORE)) / 1.3
     axes.set_xscale("log")
     axes.set_xticks(distance(SCORE_TICKS), labels)
@@ -126,113 +120,34 @@ def _scale_by_score(axes: Axes, shown: Sequence[float]) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-def plot_travel(
-    runs: pd.DataFrame, estimates: pd.DataFrame, agents: Sequence[str], path: Path
-) -> None:
-    """Draw the mean error and the mean valve travel of each controller that moves the valve.
-
-    Parameters
-    ----------
-    runs : pandas.DataFrame
-        A row for each run, with `scenario`, `agent`, `mae` and `total_variation`.
-    estimates : pandas.DataFrame
-        A row for each case and controller; `limit` is the lowest achievable error of the case.
-    agents : sequence of str
-        The controllers in the order of the legend.
-    path : Path
-        The PNG file. None is written if no controller moves the valve.
-    """
-    means = travel_means(runs, estimates)
-    if means.empty:
-        return
-    marks = marks_of([agent for agent in agents if agent in set(means["agent"])])
-    cases = [str(case) for case in means["scenario"].unique()]
-    with open_panels(path, cases, 2.4, 2, travel_finding(means)) as panels:
-        for axes, case in zip(panels.axes, cases, strict=True):
-            rows = means[means["scenario"] == case]
-            for agent, travel, ratio in zip(
-                rows["agent"], rows["travel"], rows["ratio"], strict=True
-            ):
-                axes.plot(travel, excess(ratio), **marks[agent])
-            scale_by_ratio(axes, "y", rows["ratio"])
-            _scale_by_travel(axes, rows["travel"])
-        entries: dict[str, Artist] = {}
-        for agent, mark in marks.items():
-            entries[label(agent)] = Line2D([], [], **mark)
-        panels.label_edges("valve travel of a run (t/h, logarithmic axis)", RATIO_LABEL)
-        panels.add_legend(entries, columns=4)
-
-
-def travel_means(runs: pd.DataFrame, estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return the means over the runs of each case and controller that moves the valve.
-
-    The columns are `scenario`, `agent`, `ratio` (the mean error divided by the lowest
-    achievable one) and `travel` (t/h).
-    """
-    means = runs.groupby(["scenario", "agent"], sort=False)[["mae", "total_variation"]].mean()
-    means = means.reset_index().rename(columns={"total_variation": "travel"})
-    limits = estimates.groupby("scenario")["limit"].first()
-    means["ratio"] = means["mae"] / means["scenario"].map(limits)
-    return means[means["travel"] > 0.0]
-
-
-def travel_finding(means: pd.DataFrame) -> str:
-    """Return a sentence that says whose error is small with little valve travel.
-
-    `means` are those of `travel_means`. In each case, it looks for the controller that moves
-    the valve least among those with nearly the smallest error.
-    """
-    if means["agent"].nunique() == 1:
-        return f"Mean error and valve travel of {label(means['agent'].iloc[0])}"
-    sparing = []
-    for _, rows in means.groupby("scenario", sort=False):
-        good = rows[rows["mae"] <= NEARLY_BEST * rows["mae"].min()]
-        sparing.append(good.sort_values("travel")["agent"].iloc[0])
-    counts = pd.Series(sparing).value_counts(sort=True)
-    where = ""
-    if len(sparing) > 1:
-        where = f" in {counts.iloc[0]} of {len(sparing)} cases"
-    return (
-        f"Among the controllers with an error within {percent(NEARLY_BEST - 1.0)} of the "
-        f"smallest, {label(counts.index[0])} moves the valve least{where}"
-    )
-
-
-def _scale_by_travel(axes: Axes, travels: pd.Series[float]) -> None:
-    """Make the x axis, of valve travel in t/h, logarithmic."""
-    axes.set(xscale="log", xlim=(0.7 * travels.min(), 1.4 * travels.max()))
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_locator(NullLocator())
-
-
 def plot_responses(
     responses: pd.DataFrame, errors: pd.Series[float], scenario: Scenario, path: Path
 ) -> None:
-    """Draw temperature and flow over a whole run, a row for each controller, the best first.
+    """Draw temperature and flow over a run in a row for each controller, the best first.
 
     Parameters
     ----------
     responses : pandas.DataFrame
-        A row for each controller and sample, as `comparison.run_case` returns it.
+        A row for each controller and sample, as in `comparison.Result`.
     errors : pandas.Series
         Mean error of each controller, degC.
     scenario : Scenario
-        The case.
+        The scenario.
     path : Path
         The PNG file.
     """
     agents = errors[responses["agent"].unique()].sort_values(kind="stable").index
     styles = looks([*agents])
     title = f"{scenario.title}: {responses_finding(errors[agents])}"
-    with open_picture(path, 1.2 + 1.25 * len(agents), title) as figure:
+    height = 1.2 + 1.25 * len(agents)  # inches: title and legend, and the rows
+    with open_picture(path, height, title) as figure:
         grid = figure.subplots(len(agents), 2, sharex=True, sharey="col", squeeze=False)
-        for (left, right), agent in zip(grid, agents, strict=True):
+        for (temperature_axes, flow_axes), agent in zip(grid, agents, strict=True):
             rows = responses[responses["agent"] == agent]
             colour, _ = styles[agent]
-            left.set_title(f"{label(agent)}: mean error {errors[agent]:.3f} °C")
-            _draw_temperature(left, rows, colour)
-            _draw_flow(right, rows, colour, scenario.parameters)
+            temperature_axes.set_title(f"{label(agent)}: mean error {errors[agent]:.3f} °C")
+            _draw_temperature(temperature_axes, rows, colour)
+            _draw_flow(flow_axes, rows, colour, scenario.parameters)
         for axes in grid[-1]:
             axes.set_xlabel("time (min)")
             axes.set_xlim(0.0, responses["time_s"].max() / 60.0)
@@ -243,7 +158,10 @@ def plot_responses(
 
 
 def responses_finding(errors: pd.Series[float]) -> str:
-    """Return a sentence on the smallest and the largest of some errors, in rising order."""
+    """Return a clause that compares the controllers with the smallest and the largest error.
+
+    `errors` are the mean errors of the controllers in rising order, degC.
+    """
     best = str(errors.index[0])
     worst = str(errors.index[-1])
     if best == worst:
@@ -253,7 +171,10 @@ def responses_finding(errors: pd.Series[float]) -> str:
 
 
 def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
-    """Draw the set point, the first run, and where most of the runs are."""
+    """Draw the set point, the output of the first run, and a band with most of the runs.
+
+    `rows` are the responses of one controller.
+    """
     minutes = rows["time_s"] / 60.0
     axes.fill_between(minutes, rows["output_p10"], rows["output_p90"], color=colour, **BAND)
     axes.plot(minutes, rows["output_run"], color=colour, linewidth=1.2)
@@ -262,9 +183,9 @@ def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
 
 
 def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -> None:
-    """Draw the applied flow of the first run, with the dead zone and the limits of the flow.
+    """Draw the applied flow of the first run, the dead zone, and the limits of the flow.
 
-    Where these are randomised, the smallest dead zone and the widest limits are drawn.
+    If the dead zone has a range, the smallest one is drawn; of the limits, the widest.
     """
     dead_zone = plant.range_of("dead_zone")[0]
     axes.axhspan(-dead_zone, dead_zone, **DEAD_ZONE)
@@ -276,12 +197,12 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
 
 
 def _legend_of_responses(responses: pd.DataFrame, plant: Parameters) -> dict[str, Any]:
-    """Return what stands for the lines and areas that are drawn of a case, by its text."""
-    is_spread = bool((responses["output_p90"] > responses["output_p10"]).any())
+    """Return the entries of the legend: an artist for each text."""
+    runs_differ = bool((responses["output_p90"] > responses["output_p10"]).any())
     run = Line2D([], [], color="black", linewidth=1.2)
     band = Patch(color="black", **BAND)
     entries: dict[str, Any] = {"set point": Line2D([], [], **SETPOINT)}
-    if is_spread:
+    if runs_differ:
         entries["first run; 10th to 90th percentile of all"] = (band, run)
     elif plant.setpoint == "random":
         entries["first run"] = run

@@ -1,7 +1,9 @@
-"""Implement a predictive controller that knows plant and actuator exactly, not the future.
+"""Implement a predictive controller that knows all of the plant and actuator but the future.
 
-It shows how close a controller can come to the bounds of `benchmarks.bounds`.
+Its errors show how close a controller can come to the bounds of `benchmarks.bounds`.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,49 +17,59 @@ from mptc_gym.signals import LOAD_INTERVAL, Levels
 
 Array = NDArray[np.float64]
 
-HORIZON = 5  # planned commands; the first is applied, then all are planned again
-SWEEPS, TOLERANCE = 100, 1e-4  # of coordinate descent: most sweeps, and t/h to stop at
-TINY = 1e-9  # degC^2, added to the variance of xi so that the filter trusts the readings
-BISECTIONS = 20  # of a hedged set point: to a millionth of the range of levels
+HORIZON = 5  # flows in a plan; the first is applied, then all are planned again
+SWEEPS = 100  # the largest number of sweeps of coordinate descent
+TOLERANCE = 1e-4  # t/h; coordinate descent stops if a sweep changes no flow by this much
+TINY = 1e-9  # added to variances, degC^2, and to divisors, so that none of them is 0
+BISECTIONS = 20  # They find a hedged set point to a millionth of the range of levels.
 WARM_UP = 200  # samples until the covariance of the filter hardly changes
 
 
 def probability_held(
     age: NDArray[np.intp], ahead: NDArray[np.intp], shortest: int, longest: int
 ) -> Array:
-    """Return the probability that a random level still holds `ahead` samples later.
+    """Return the probability that a random level of the set point still holds later.
 
-    A level holds for a number of samples that is uniform from `shortest` to `longest`. It began
-    `age` samples ago. All arguments broadcast together.
+    Parameters
+    ----------
+    age
+        Samples since the level began. The arguments broadcast together.
+    ahead
+        Samples from the present to the time of which the probability is asked.
+    shortest, longest
+        A level holds for a number of samples that is uniform from `shortest` to `longest`.
     """
-    longer = np.clip((longest - age - ahead) / (longest - shortest + 1), 0.0, 1.0)
+    until_then = np.clip((longest - age - ahead) / (longest - shortest + 1), 0.0, 1.0)
     until_now = np.clip((longest - age) / (longest - shortest + 1), TINY, 1.0)
-    return np.asarray(longer / until_now)
+    return np.asarray(until_then / until_now)
 
 
 def hedged_setpoints(setpoint: Array, held: Array, amplitude: float, deviation: Array) -> Array:
-    """Return the outputs to aim at while the set point may change on the way, degC.
+    """Return the outputs to aim at if the set point may change during the delay, degC.
 
-    A flow shows only after the delay. By then the set point is still `setpoint` with the
-    probability `held`, otherwise it is a new level, uniform within +-`amplitude`, degC. Let the
-    output be r + n, where n is normal with the standard deviation `deviation`, degC. The r that
-    minimises E|y_d - r - n| is the median of y_d - n:
+    A flow shows only after the delay. After the delay, the set point y_d is still `setpoint`,
+    degC, with the probability `held`. Otherwise y_d is a new level, uniform between the limits
+    -`amplitude` and `amplitude`, degC. Let the output be r + n, where n is normal with the
+    standard deviation `deviation`, degC. The r that minimises E|y_d - r - n| is the median of
+    y_d - n:
 
         held Phi((r - setpoint) / deviation) + (1 - held) G(r) = 1/2.
 
-    G(r) is the mean of Phi((r - x) / deviation) over all levels x: with the integral of Phi,
-    I(z) = z Phi(z) + phi(z),
+    G(r) is the mean of Phi((r - x) / deviation) over all levels x. With the integral of Phi,
+    I(z) = z Phi(z) + phi(z), it is
 
         G(r) = deviation (I((r + amplitude) / deviation) - I((r - amplitude) / deviation))
                / (2 amplitude).
 
-    The left side rises with r, so bisection finds it. All arguments broadcast together.
+    The left side of the equation rises with r, so bisection finds r. The arguments broadcast
+    together.
     """
-    from scipy.special import ndtr  # here: slow to import
+    from scipy.special import ndtr  # imported here, as SciPy is slow to import
 
-    deviation = np.maximum(deviation, TINY)  # without noise the normal law becomes a step
+    deviation = np.maximum(deviation, TINY)  # Without noise, Phi is a step.
     shape = np.broadcast_shapes(*map(np.shape, (setpoint, held, deviation)))
-    low, high = np.full(shape, -amplitude), np.full(shape, amplitude)
+    low = np.full(shape, -amplitude)
+    high = np.full(shape, amplitude)
     for _ in range(BISECTIONS):
         r = (low + high) / 2.0
         below_level = ndtr((r - setpoint) / deviation)
@@ -72,44 +84,100 @@ def hedged_setpoints(setpoint: Array, held: Array, amplitude: float, deviation: 
 
 def _integral_of_phi(z: Array) -> Array:
     """Return the integral of the standard normal distribution function up to z."""
-    from scipy.special import ndtr  # here: slow to import
+    from scipy.special import ndtr  # imported here, as SciPy is slow to import
 
     density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
     return np.asarray(z * ndtr(z) + density)
 
 
+@dataclass(frozen=True)
+class _Model:
+    """The plants in the step to a sample, and what a plan of flows does to their outputs.
+
+    `n` is the number of runs.
+
+    Attributes
+    ----------
+    plants : LinearModel
+        The plants of all runs.
+    response : Array
+        G, shape (n, HORIZON, HORIZON): the changes of the outputs by the planned flows,
+        `outputs = G flows`, degC per t/h.
+    hessian : Array
+        G' G, shape (n, HORIZON, HORIZON).
+    rows : Array
+        G' G with the runs last, shape (HORIZON, HORIZON, n), which is quick to loop over.
+    """
+
+    plants: LinearModel
+    response: Array
+    hessian: Array
+    rows: Array
+
+    @classmethod
+    def of(cls, plants: LinearModel) -> "_Model":
+        """Return the model of these plants."""
+        impulse_response = plants.impulse_response(HORIZON)
+        response = np.zeros((len(impulse_response), HORIZON, HORIZON))
+        for j in range(HORIZON):
+            response[:, j:, j] = impulse_response[:, : HORIZON - j]
+        hessian = response.transpose(0, 2, 1) @ response
+        rows = np.ascontiguousarray(hessian.transpose(1, 2, 0))
+        return cls(plants, response, hessian, rows)
+
+    def cost(self, plan: Array, slopes: Array) -> Array:
+        """Return the cost of a plan for each run, but for a constant, shape (n,), degC^2.
+
+        `plan` are flows, t/h, and `slopes` are G' (target - free outputs), both of shape
+        (HORIZON, n).
+        """
+        quadratic = np.einsum("in,nij,jn->n", plan, self.hessian, plan) / 2.0
+        return np.asarray(quadratic - (slopes * plan).sum(axis=0))
+
+
 class PredictiveController:
-    """Plan, at each sample, the inputs that bring the expected output to the set point.
+    """Plan, at each sample, the flows that bring the expected output to the set point.
 
-    The controller knows A, B, C and d of the plant (28), even where loop i draws them with seed
-    `seed + i`, and the course of their drift. A Kalman filter estimates the output, xi and the
-    load from the transmitter's readings; for the jumps of the load, which are not normal, it is
-    the best linear filter. The score is the mean of |e|, so the expected outputs are medians:
-    the load is expected to stay as it is. The plan minimises the sum of squared differences
-    between these and the outputs to aim at, over the samples that its commands reach first, for
-    inputs within the limits. A first input inside the dead zone is replaced by 0 or by the
-    input at a command on the edge, whichever gives the better plan.
+    The controller knows A, B, C and d of the plant (28) and the course of their drift, even if
+    run i draws them with the seed `seed + i`. A Kalman filter estimates the output, xi and the
+    load from the transmitter's readings. The jumps of the load are not normal; for them, it is
+    the best linear filter.
 
-    The outputs to aim at are the set point, as if it held for ever. Random set points have a
-    law, which tells from the age of a level how likely it is to change before a command shows:
-    see `hedged_setpoints`.
+    The score depends on the mean of |e|, so the expected outputs are medians, and the load is
+    expected not to change. The plan minimises the sum of squared differences between the
+    expected outputs and the outputs to aim at, over the samples that the planned flows reach
+    first, for flows within the limits. A first flow inside the dead zone is replaced by 0 or by
+    the flow of a command on the edge of the dead zone, whichever gives the better plan.
+
+    The output to aim at is the set point, as if it never changed. If set points are random, the
+    age of a level tells how likely a change is before a flow shows; see `hedged_setpoints`.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        All arguments of the environment.
+    num_envs : int
+        Number of runs.
+    seed : int
+        Seed of the first run.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:
-        self._p = parameters
+        self._parameters = parameters
         self._num_envs = num_envs
-        self._numbers = numbers = drawn_numbers(parameters, num_envs, seed)
-        self._delay = numbers.delay.astype(np.intp)
-        self._u_min, self._u_max = numbers.u_min, numbers.u_max
-        self._dead_zone = numbers.dead_zone
-        # Where the load may change, a level x becomes (1 - p) x in the mean, and its variance
-        # stays the same.
-        self._stays = 1.0 - np.minimum(LOAD_INTERVAL / numbers.disturbance_interval, 1.0)
-        uniform = np.square(numbers.disturbance_amplitude) / 3.0
-        steps = uniform * (1.0 - np.square(self._stays))
-        walk = LOAD_INTERVAL * numbers.disturbance_walk_variance
-        self._variances = np.stack([numbers.noise_variance + TINY, steps, walk], axis=1)
-        self._drifts = parameters.drifts
+        self._numbers = drawn_numbers(parameters, num_envs, seed)
+        self._delay = self._numbers.delay.astype(np.intp)
+        # Where the load may change, with the probability p, a level x becomes (1 - p) x in the
+        # mean. The variance of the levels is the same before and after.
+        interval = self._numbers.disturbance_interval
+        self._load_stays = 1.0 - np.minimum(LOAD_INTERVAL / interval, 1.0)
+        load_variance = (
+            np.square(self._numbers.disturbance_amplitude) / 3.0
+        )  # of a uniform level
+        steps_variance = load_variance * (1.0 - np.square(self._load_stays))
+        walk_variance = LOAD_INTERVAL * self._numbers.disturbance_walk_variance
+        noise_variance = self._numbers.noise_variance + TINY
+        self._variances = np.stack([noise_variance, steps_variance, walk_variance], axis=1)
         # The state: y(k), y(k-1), ...; xi(k), xi(k-1), ...; the steps of the load and its walk.
         self._n_y = max(len(parameters.a) - 1, 1)
         self._size = self._n_y + len(parameters.c) - 1 + 2
@@ -118,7 +186,7 @@ class PredictiveController:
         lag = np.arange(len(parameters.b)) + 1
         self._shows = (self._delay[:, np.newaxis, np.newaxis] + lag - ahead).clip(0)
         self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON, dtype=np.intp)
-        self._models: dict[int, tuple[LinearModel, Array, Array]] = {}  # by age, samples
+        self._models: dict[int, _Model] = {}  # by the sample from which the coefficients hold
         self._levels = Levels(parameters)
         if self._levels.random:
             self._deviation = self._forecast_deviation()
@@ -131,42 +199,51 @@ class PredictiveController:
         self._state = np.zeros((n, self._size))
         self._covariance = np.zeros((n, self._size, self._size))
         # u(k-1), u(k-2), ..., after a 0 that stands for future inputs.
-        self._inputs = np.zeros((n, 1 + int(self._delay.max()) + len(self._p.b)))
+        longest_memory = int(self._delay.max()) + len(self._parameters.b)
+        self._inputs = np.zeros((n, 1 + longest_memory))
         self._plan = np.zeros((HORIZON, n))
-        self._setpoint = np.full(n, np.nan)  # the latest, degC
-        self._age = np.zeros(n, np.intp)  # samples since it began
+        self._setpoint = np.full(n, np.nan)  # the latest one, degC
+        self._age = np.zeros(n, np.intp)  # samples since the set point changed
 
     def act(self, observation: Array) -> NDArray[np.float32]:
         """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
-        seen = np.asarray(observation, dtype=np.float64)
-        setpoint = seen[:, 0]
-        if self._k:
-            self._filter(setpoint - seen[:, self._p.setpoint_window])
-        _, G, Q = self._model(self._k)
-        free = np.take_along_axis(self._predict(), self._reached, axis=1)
-        target = np.einsum("ni,nij->nj", self._aims(setpoint) - free, G)
+        observation = np.asarray(observation, dtype=np.float64)
+        setpoint = observation[:, 0]
+        if self._k > 0:
+            error = observation[:, self._parameters.setpoint_window]
+            self._filter(setpoint - error)
+        model = self._model(self._k)
+        free_outputs = np.take_along_axis(self._predict(), self._reached, axis=1)
+        missing = self._aims(setpoint) - free_outputs
+        slopes = np.ascontiguousarray(np.einsum("ni,nij->nj", missing, model.response).T)
         start = np.vstack([self._plan[1:], self._plan[-1:]])
-        plan = self._optimise(Q, target, start)
-        command = plan[0]
-        inside = np.abs(command) < self._dead_zone
-        if inside.any():
-            edge = np.copysign(self._dead_zone, command)
-            flow = applied_flow(edge, self._dead_zone, self._u_min, self._u_max)
-            plans = [self._optimise(Q, target, plan, first) for first in (0.0, flow)]
-            rests = np.less_equal(
-                *(np.einsum("in,nij,jn->n", u, Q, u) / 2 - (target.T * u).sum(0) for u in plans)
+        plan = self._optimise(model, slopes, start)
+        command = plan[0].copy()
+        is_inside = np.abs(command) < self._numbers.dead_zone
+        if is_inside.any():
+            edge = np.copysign(self._numbers.dead_zone, command)
+            flow = applied_flow(
+                edge, self._numbers.dead_zone, self._numbers.u_min, self._numbers.u_max
             )
-            plan = np.where(inside, np.where(rests, *plans), plan)
-            command = np.where(inside, np.where(rests, 0.0, edge), command)
+            resting_plan = self._optimise(model, slopes, plan, first_flow=0.0)
+            edge_plan = self._optimise(model, slopes, plan, first_flow=flow)
+            rests = model.cost(resting_plan, slopes) <= model.cost(edge_plan, slopes)
+            plan = np.where(is_inside, np.where(rests, resting_plan, edge_plan), plan)
+            command = np.where(is_inside, np.where(rests, 0.0, edge), command)
         self._plan = plan
         self._inputs[:, 2:] = self._inputs[:, 1:-1].copy()
         self._inputs[:, 1] = plan[0]
         self._k += 1
-        action = float32_action(command, self._u_min, self._u_max, self._dead_zone)
+        action = float32_action(
+            command, self._numbers.u_min, self._numbers.u_max, self._numbers.dead_zone
+        )
         return action[:, np.newaxis]
 
     def _aims(self, setpoint: Array) -> Array:
-        """Return the outputs to aim at when the planned commands show, (runs, HORIZON)."""
+        """Return the outputs to aim at when the planned commands show, degC.
+
+        `setpoint` has the shape (runs,), and the result has the shape (runs, HORIZON).
+        """
         if not self._levels.random:
             return np.broadcast_to(setpoint[:, np.newaxis], (len(setpoint), HORIZON))
         self._age = np.where(setpoint == self._setpoint, self._age + 1, 0)
@@ -191,101 +268,128 @@ class PredictiveController:
         the filter has settled. The shape is (runs,).
         """
         self.reset()
-        model, *_ = self._model(0)
+        plants = self._model(0).plants
         for k in range(1, WARM_UP):
-            self._update_covariance(*self._transition(k, model))
+            self._update_covariance(*self._transition(k, plants))
         P = self._covariance
         variance = np.zeros(self._num_envs)
         for ahead in range(int(self._delay.max()) + 1):
-            F, Q = self._transition(WARM_UP + ahead, model)
+            F, Q = self._transition(WARM_UP + ahead, plants)
             P = F @ P @ F.transpose(0, 2, 1) + Q
             variance = np.where(ahead == self._delay, P[:, 0, 0], variance)
         return np.sqrt(variance)
 
     def _filter(self, output: Array) -> None:
-        """Advance the state from k - 1 to k, and correct it with the reading y(k)."""
-        model, *_ = self._model(self._k)
-        F, Q = self._transition(self._k, model)
-        x = np.einsum("nij,nj->ni", F, self._state)
-        past = np.take_along_axis(self._inputs, self._shows[:, 0], axis=1)
-        x[:, 0] += (past * model.beta).sum(axis=1)
+        """Advance the state from k - 1 to k, and correct it with the reading y(k).
+
+        `output` is the reading, degC, shape (runs,).
+        """
+        plants = self._model(self._k).plants
+        F, Q = self._transition(self._k, plants)
+        state = np.einsum("nij,nj->ni", F, self._state)
+        flows = np.take_along_axis(self._inputs, self._shows[:, 0], axis=1)
+        state[:, 0] += (flows * plants.beta).sum(axis=1)
         gain = self._update_covariance(F, Q)
-        self._state = x + gain * (output - x[:, 0])[:, np.newaxis]
+        self._state = state + gain * (output - state[:, 0])[:, np.newaxis]
 
     def _update_covariance(self, F: Array, Q: Array) -> Array:
-        """Advance the covariance by a sample, and return the gain of its reading."""
+        """Advance the covariance of the state by a sample, and return the gain of its reading.
+
+        F is the state transition, and Q is the covariance of the process noise, both of shape
+        (runs, size, size). The gain has the shape (runs, size).
+        """
         P = F @ self._covariance @ F.transpose(0, 2, 1) + Q
         variance = P[:, 0, 0] + self._numbers.measurement_noise_variance
         gain: Array = P[:, :, 0] / variance[:, np.newaxis]
         self._covariance = P - gain[:, :, np.newaxis] * P[:, np.newaxis, 0]
         return gain
 
-    def _transition(self, k: int, model: LinearModel) -> tuple[Array, Array]:
-        """Return the state transition from k - 1 to k, and the process noise's covariance."""
-        changes = k % LOAD_INTERVAL == 0
+    def _transition(self, k: int, plants: LinearModel) -> tuple[Array, Array]:
+        """Return the state transition from k - 1 to k, and the covariance of the process noise.
+
+        Both have the shape (runs, size, size).
+        """
+        load_changes = k % LOAD_INTERVAL == 0
+        steps, walk = self._size - 2, self._size - 1  # the parts of the load in the state
         F = np.zeros((self._num_envs, self._size, self._size))
         sources = np.zeros((self._num_envs, self._size, 3))  # xi, the steps and the walk
-        F[:, :-2, :-2], sources[:, :-2, 0] = model.state_space()
-        F[:, -2, -2], F[:, -1, -1] = self._stays if changes else 1.0, 1.0
-        F[:, 0, -2:] = model.load[:, np.newaxis] * F[:, [-2, -1], [-2, -1]]
-        sources[:, 0, 1:] = model.load[:, np.newaxis]
-        sources[:, -2, 1] = sources[:, -1, 2] = 1.0
-        variances = self._variances * [1, changes, changes]
+        F[:, :steps, :steps], sources[:, :steps, 0] = plants.state_space()
+        F[:, steps, steps] = self._load_stays if load_changes else 1.0
+        F[:, walk, walk] = 1.0
+        F[:, 0, steps] = plants.load * F[:, steps, steps]
+        F[:, 0, walk] = plants.load
+        sources[:, 0, 1:] = plants.load[:, np.newaxis]
+        sources[:, steps, 1] = 1.0
+        sources[:, walk, 2] = 1.0
+        variances = self._variances * [1, load_changes, load_changes]
         return F, np.einsum("nk,nik,njk->nij", variances, sources, sources)
 
     def _predict(self) -> Array:
-        """Return the outputs expected from k + 1 on without further commands."""
-        c, n_y = self._p.c, self._n_y
-        every = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
-        moved = self._inputs[every, self._shows[:, 1:]]
-        ahead = range(self._k + 1, self._k + 1 + moved.shape[1])
-        models = [self._model(k)[0] for k in ahead]
-        moved *= np.stack([model.beta for model in models], axis=1)
-        outputs = [self._state[:, i] for i in range(n_y - 1, -1, -1)]
-        xi = self._state[:, n_y:-2]
-        load = self._state[:, -2] + self._state[:, -1]
-        for i, (model, flow) in enumerate(zip(models, moved.sum(axis=2).T, strict=True)):
-            output = flow + model.load * load
-            for j in range(len(self._p.a) - 1):
-                output = output + model.alpha[:, j] * outputs[-1 - j]
-            for j in range(i + 1, len(c)):
-                output = output + c[j] * xi[:, j - i - 1]
-            outputs.append(output)
-        return np.stack(outputs[n_y:], axis=1)
+        """Return the outputs expected from k + 1 on without further commands, degC.
 
-    def _model(self, k: int) -> tuple[LinearModel, Array, Array]:
-        """Return the plants for the step to sample k; G, from planned inputs to outputs; G' G.
-
-        The sum of squared errors of a plan u is u G' G u - 2 (target G) u, but for a constant.
+        The shape is (runs, longest delay + HORIZON).
         """
-        age = k // DRIFT_INTERVAL * DRIFT_INTERVAL if self._drifts else 0
-        if age not in self._models:
-            plants = LinearModel(self._p, self._numbers, age)
-            response = plants.impulse_response(HORIZON)
-            G = np.zeros((self._num_envs, HORIZON, HORIZON))
-            for j in range(HORIZON):
-                G[:, j:, j] = response[:, : HORIZON - j]
-            self._models[age] = plants, G, G.transpose(0, 2, 1) @ G
-        return self._models[age]
+        c = self._parameters.c
+        runs = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
+        flows = self._inputs[runs, self._shows[:, 1:]]
+        models = [self._model(self._k + 1 + ahead).plants for ahead in range(flows.shape[1])]
+        flows *= np.stack([plants.beta for plants in models], axis=1)
+        responses = flows.sum(axis=2)
+        outputs = [self._state[:, i] for i in reversed(range(self._n_y))]  # the newest last
+        xi = self._state[:, self._n_y : -2]
+        load = self._state[:, -2] + self._state[:, -1]
+        for ahead, plants in enumerate(models):
+            output = responses[:, ahead] + plants.load * load
+            for j in range(len(self._parameters.a) - 1):
+                output = output + plants.alpha[:, j] * outputs[-1 - j]
+            for j in range(ahead + 1, len(c)):
+                output = output + c[j] * xi[:, j - ahead - 1]
+            outputs.append(output)
+        return np.stack(outputs[self._n_y :], axis=1)
+
+    def _model(self, k: int) -> _Model:
+        """Return the model for the step to sample k."""
+        first = 0
+        if self._parameters.drifts:
+            first = k // DRIFT_INTERVAL * DRIFT_INTERVAL
+        if first not in self._models:
+            plants = LinearModel(self._parameters, self._numbers, first)
+            self._models[first] = _Model.of(plants)
+        return self._models[first]
 
     def _optimise(
-        self, Q: Array, target: Array, start: Array, first: Array | float | None = None
+        self,
+        model: _Model,
+        slopes: Array,
+        start: Array,
+        first_flow: Array | float | None = None,
     ) -> Array:
-        """Minimise u Q u / 2 - target u within the limits by coordinate descent.
+        """Return the plan with the least cost within the limits, by coordinate descent.
 
-        Plans have one row per command here, shape (HORIZON, runs).
+        Parameters
+        ----------
+        model
+            The model of the plants, which defines the cost.
+        slopes
+            The linear part of the cost; see `_Model.cost`.
+        start
+            The plan to start from, t/h. All plans have the shape (HORIZON, runs).
+        first_flow
+            The first flow of the plan, t/h; None if it is free, too.
         """
         plan = start.copy()
-        if first is not None:
-            plan[0] = first
-        rows = np.ascontiguousarray(Q.transpose(1, 2, 0))
-        targets = np.ascontiguousarray(target.T)
+        free = range(HORIZON)
+        if first_flow is not None:
+            plan[0] = first_flow
+            free = range(1, HORIZON)
         for _ in range(SWEEPS):
             before = plan.copy()
-            for i in range(0 if first is None else 1, HORIZON):
-                slope = targets[i] - np.add.reduce(plan * rows[i])
-                best = np.maximum(plan[i] + slope / rows[i, i], self._u_min)
-                np.minimum(best, self._u_max, out=plan[i])
+            for i in free:
+                # The derivative of the cost by this flow becomes 0 at the best flow.
+                descent = slopes[i] - np.add.reduce(plan * model.rows[i])
+                best = plan[i] + descent / model.rows[i, i]
+                np.maximum(best, self._numbers.u_min, out=best)
+                np.minimum(best, self._numbers.u_max, out=plan[i])
             if np.abs(plan - before).max() < TOLERANCE:
                 break
         return plan

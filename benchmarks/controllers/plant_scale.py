@@ -1,4 +1,4 @@
-"""Tell how one plant differs from another in what the settings of a controller depend on."""
+"""Compare the magnitudes of plants, and scale the gains of controllers between plants."""
 
 import math
 from collections.abc import Mapping
@@ -7,9 +7,9 @@ from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
 
-MUCH = 2.0  # factor from which on a number of the plant counts as different
+MUCH = 2.0  # Two plants differ if one of their magnitudes differs by more than this factor.
 PAPER = Parameters()
-# Searches for gains on the paper's plant look between these values.
+# The intervals in which a search on the paper's plant looks for each gain.
 PI_SPANS = {"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}
 NN_SPANS = {
     "eta": (1e-3, 10.0),
@@ -20,7 +20,7 @@ NN_SPANS = {
     "weight_scale": (0.05, 2.0),
 }
 
-Spans = Mapping[str, tuple[float, float]]
+Spans = Mapping[str, tuple[float, float]]  # the interval of each gain
 
 
 def direction(plant: Parameters) -> int:
@@ -29,9 +29,9 @@ def direction(plant: Parameters) -> int:
 
 
 def scales(plant: Parameters) -> dict[str, float]:
-    """Return the magnitudes of the nominal plant, by what they are and their unit.
+    """Return four magnitudes of the nominal plant, by their name and unit.
 
-    The reach is what half the range of the flow changes the temperature by. An integrating
+    The reach is the change of the temperature by half the range of the flow. An integrating
     plant has an infinite gain, reach and time constant.
     """
     model = nominal(plant)
@@ -49,20 +49,24 @@ def scales(plant: Parameters) -> dict[str, float]:
     }
 
 
-def difference(plant: Parameters, other: Parameters) -> str:
-    """Return which magnitudes differ by a factor of more than `MUCH`, in words; "" if none."""
-    here, there = scales(plant), scales(other)
+def difference(plant: Parameters, made_for: Parameters) -> str:
+    """Return in words which magnitudes of two plants differ by a factor of more than `MUCH`.
+
+    The text is "" if no magnitude does.
+    """
+    expected = scales(made_for)
     parts = []
-    for name, value in here.items():
-        reference = there[name]
-        if max(value, reference) > MUCH * min(value, reference):
+    for name, value in scales(plant).items():
+        if max(value, expected[name]) > MUCH * min(value, expected[name]):
             quantity, unit = name.rsplit(", ", 1)
-            parts.append(f"the {quantity} is {value:.3g} {unit}, there {reference:.3g}")
+            parts.append(
+                f"the {quantity} is {value:.3g} {unit} in place of {expected[name]:.3g}"
+            )
     return "; ".join(parts)
 
 
 def _finite_scales(plant: Parameters) -> dict[str, float]:
-    """Return `scales`; a ValueError is raised if one of them is not finite and positive."""
+    """Return `scales` of a plant; raise a ValueError if one is infinite, zero or negative."""
     numbers = scales(plant)
     for name, value in numbers.items():
         if not 0.0 < value < math.inf:
@@ -74,24 +78,25 @@ def _finite_scales(plant: Parameters) -> dict[str, float]:
 
 
 def pi_spans(plant: Parameters) -> Spans:
-    """Return where to search for gains of the PI: those of the paper's plant, scaled.
+    """Return the intervals for gains of a PI on a plant: those on the paper's plant, scaled.
 
-    The gains are inverse to the plant's gain, and take its sign; `ki`, per sample, is inverse
-    to the time constant, too.
+    Both gains are inverse to the plant's gain, and have its sign. The integral gain `ki`, per
+    sample, is inverse to the time constant, too.
     """
-    here, paper = _finite_scales(plant), scales(PAPER)
-    kp = paper["gain, °C per t/h"] / here["gain, °C per t/h"]
+    numbers = _finite_scales(plant)
+    paper_numbers = scales(PAPER)
+    kp = paper_numbers["gain, °C per t/h"] / numbers["gain, °C per t/h"]
     if direction(plant) != direction(PAPER):
         kp = -kp
-    ki = kp * paper["time constant, samples"] / here["time constant, samples"]
+    ki = kp * paper_numbers["time constant, samples"] / numbers["time constant, samples"]
     return _scaled(PI_SPANS, {"kp": kp, "ki": ki})
 
 
 def nn_spans(plant: Parameters) -> Spans:
-    """Return where to search for gains of the network: those of the paper's plant, scaled.
+    """Return the intervals for gains of the network: those on the paper's plant, scaled.
 
-    Gain factors multiply an error, and the input scale a temperature: both are inverse to the
-    temperatures that the flow reaches. The initial weights have no unit.
+    The gain factors multiply an error and the input scale multiplies a temperature. Both are
+    inverse to the temperatures that the flow can reach. The initial weights have no unit.
     """
     reach = "reach of half the flow's range, °C"
     factor = scales(PAPER)[reach] / _finite_scales(plant)[reach]
@@ -100,7 +105,7 @@ def nn_spans(plant: Parameters) -> Spans:
 
 
 def dahlin_spans(plant: Parameters) -> Spans:
-    """Return where to search for the time constants of Dahlin's controller, s."""
+    """Return the intervals for the time constants of Dahlin's controller on a plant, s."""
     numbers = _finite_scales(plant)
     interval = plant.sampling_interval
     time_constant = numbers["time constant, samples"] * interval
@@ -112,7 +117,8 @@ def dahlin_spans(plant: Parameters) -> Spans:
 
 
 def _scaled(spans: Spans, factors: Mapping[str, float]) -> Spans:
-    """Return spans times the factor of each gain."""
-    return {
-        name: (low * factors[name], high * factors[name]) for name, (low, high) in spans.items()
-    }
+    """Return both ends of each interval times the factor of its gain."""
+    scaled = {}
+    for name, (first, last) in spans.items():
+        scaled[name] = first * factors[name], last * factors[name]
+    return scaled

@@ -1,7 +1,7 @@
-"""List the controllers: one record each.
+"""List the controllers, with a record for each of them.
 
-A controller is added here and nowhere else: `compare`, `sweep`, `tune` and `watch` then know
-it. A user's own (`--agent NAME=MODULE:FACTORY`) becomes such a record, too.
+A controller that is added to this list is known to `compare`, `sweep`, `tune` and `watch`. The
+option `--agent NAME=MODULE:FACTORY` makes a record of a user's own controller.
 """
 
 import itertools
@@ -39,44 +39,56 @@ from benchmarks.controllers.spec import (
 from benchmarks.loop.rollout import Agent, IdleValve
 from mptc_gym import PRESETS, Parameters
 
-LAMBDA = 0.1  # closed-loop time constant of Dahlin's controller, as a share of the plant's
-# Colours and markers of a user's own controllers, in turn.
+LAMBDA = 0.1  # closed-loop time constant of Dahlin's controller / time constant of the plant
+# The colours and markers that a user's own controllers get in turn.
 OWN_LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d")
 
 
 def with_bank(
     kind: type[SelfTuningController], *, widest_dead_zone: float, **prior_knowledge: Any
 ) -> SelfTuningController:
-    """Return a controller with a bank of models, whose commands clear the widest dead zone."""
+    """Return a controller with a bank of models, made for the widest dead zone of the plant.
+
+    `kind` is its class, and `widest_dead_zone` is in t/h. See `knowledge` for the other prior
+    knowledge.
+    """
     return kind(dead_zone=widest_dead_zone, **prior_knowledge)
 
 
 def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
-    """Return the paper's network after it has learnt on the plant that it is made for."""
+    """Return the paper's network, which has learnt on this plant and learns no more."""
     controller: Any = ROSTER["nn"].in_service(asdict(parameters), num_envs, seed)
     controller.learning = False
     return controller  # type: ignore[no-any-return]
 
 
 def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
-    """Return Dahlin's controller, by default with a lambda of a tenth of the time constant."""
+    """Return Dahlin's controller; `time_constant` is that of the plant, s.
+
+    Without the argument `closed_loop_time_constant`, it is a tenth of the plant's.
+    """
     arguments.setdefault("closed_loop_time_constant", LAMBDA * time_constant)
     return DahlinController(time_constant=time_constant, **arguments)
 
 
 def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -> Agent:
-    """Return a trained policy for the actuator's limits.
+    """Return a trained policy for the limits of an actuator.
 
-    If it compensates a dead zone, that is the plant's, where it is a number.
+    If the policy compensates a dead zone, it compensates that of the plant. If the dead zone of
+    the plant has a range, the policy compensates that of its training.
     """
-    increments, zone = network.increments, parameters.dead_zone
-    if increments and increments.dead_zone and not isinstance(zone, Sequence):
-        increments = replace(increments, dead_zone=zone)
+    increments = network.increments
+    dead_zone = parameters.dead_zone
+    if increments and increments.dead_zone and not isinstance(dead_zone, Sequence):
+        increments = replace(increments, dead_zone=dead_zone)
     return replace(network, increments=increments, **limits)
 
 
 def trained(kind: type[PolicyNetwork | RecurrentNetwork], files: str) -> Mapping[str, Any]:
-    """Return the networks in `agents/pretrained` that match a pattern, by file."""
+    """Return the networks of a class whose files in `agents/pretrained` match a pattern.
+
+    They are returned by the name of the file.
+    """
     return {file.name: kind.load(file) for file in PRETRAINED.glob(files)}
 
 
@@ -262,7 +274,7 @@ RENAMED = {
     "nn-smith": "neural-smith",
     "nn-self-tuning": "neural-self-tuning",
 }
-"""The names of today of controllers that had another name in earlier versions."""
+"""The present names of controllers by their names in earlier versions."""
 
 
 def label(agent: str) -> str:
@@ -271,6 +283,12 @@ def label(agent: str) -> str:
 
 
 def looks(agents: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return the colour and the marker of each controller; a user's own take turns."""
-    turns = itertools.cycle(OWN_LOOKS)
-    return {agent: ROSTER[agent].look if agent in ROSTER else next(turns) for agent in agents}
+    """Return the colour and the marker of each controller by its name.
+
+    Controllers that are not in the roster get those of `OWN_LOOKS` in turn.
+    """
+    own_looks = itertools.cycle(OWN_LOOKS)
+    looks = {}
+    for agent in agents:
+        looks[agent] = ROSTER[agent].look if agent in ROSTER else next(own_looks)
+    return looks

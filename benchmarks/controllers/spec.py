@@ -1,4 +1,4 @@
-"""Define the record of a controller: all that the commands need to know of it."""
+"""Define the record of a controller, and what a controller knows of a plant."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,11 +13,11 @@ from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.signals import Levels
 
-LEARNING = 1200  # samples of the square wave on which a network is commissioned
-COMMISSIONING_SEED = SEEDS["preparation"].first  # of plants and noise during commissioning
-ROBUSTNESS = 1.6  # Ms of the loop to which rules are tuned; SIMC's own default has 1.56
+LEARNING = 1200  # samples of the square wave in which a controller learns before its service
+COMMISSIONING_SEED = SEEDS["preparation"].first  # of the plants and noise of these samples
+ROBUSTNESS = 1.6  # Ms of the loop to which rules are tuned; the rule SIMC itself leads to 1.56
 
-# What a controller may know of the plant, by the arguments of its `build`.
+# What a controller may know of the plant, as names of `knowledge`.
 LIMITS = "u_min", "u_max"
 DIRECTION = *LIMITS, "direction", "num_envs", "seed"
 STEP_TEST = *LIMITS, "gain", "time_constant", "delay", "sampling_interval"
@@ -28,10 +28,21 @@ EVERYTHING = "parameters", "num_envs", "seed"
 
 
 def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
-    """Return what a controller knows of a plant, by name, for a number of runs and a seed.
+    """Return what a controller of a batch of runs knows of a plant, by name.
 
-    Run i uses `seed + i`. Of what is sampled from ranges, these are the widest limits, the
-    middle of the dead zone and the step test of the plant in the middle.
+    Parameters
+    ----------
+    names
+        Names of quantities: `parameters`, `num_envs`, `seed`, `u_min`, `u_max` and `dead_zone`
+        (t/h), `widest_dead_zone` (t/h), `delay_range` (s), `direction` (1 or -1), and those of
+        a step test.
+    plant
+        The plant. If quantities have ranges, a controller knows the widest limits, the middle
+        of the dead zone, and the step test of the plant in the middle of the ranges.
+    runs
+        Number of runs in the batch.
+    seed
+        Seed of the first run; run i uses the seed `seed + i`.
     """
     values: dict[str, Any] = {"parameters": plant, "num_envs": runs, "seed": seed}
     values["u_min"] = plant.range_of("u_min")[0]
@@ -49,7 +60,7 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
 
 
 def delay_range(plant: Parameters) -> tuple[float, float] | None:
-    """Return the shortest and the longest delay that a plant may have, s; None if it is fixed.
+    """Return the shortest and the longest delay of a plant, s; None if the delay is fixed.
 
     They include the one sample that every input takes to show.
     """
@@ -70,114 +81,161 @@ def setpoint_holds(plant: Parameters) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSpec:
-    """A controller, or one that was trained, as all commands know it."""
+    """The record of a controller: all that the commands need to know of it.
+
+    Attributes
+    ----------
+    name : str
+        Its name in options and files.
+    label : str
+        Its name in tables and pictures.
+    look : tuple of str
+        Its colour and its marker in pictures. Related controllers have similar ones.
+    build : callable
+        Returns the controller. Its arguments are the prior knowledge and the gains by name, and
+        a `network` if the record has `networks`.
+    prior_knowledge : sequence of str
+        What the controller knows of the plant: names in `knowledge`.
+    knows : str
+        The prior knowledge in words, for tables.
+    searched : str
+        What was searched or trained beforehand, and in how many trials and samples, in words.
+    tuned_by : str
+        The argument of `build`, a time constant in s, that is chosen such that the loop with
+        the nominal plant has an Ms of `sensitivity`; "" if no argument is.
+    sensitivity : float
+        Ms, the largest magnitude of the loop's sensitivity function.
+    linear : bool
+        Whether the controller is linear away from the dead zone and the limits. Then it has a
+        method `transfer`.
+    assumes : sequence of str
+        What the controller takes for granted about the plant: its "direction", its "scale".
+    made_for : mapping
+        The plant that it was made for, by the environment's arguments.
+    observation : mapping
+        The windows of its observation, by the environment's arguments.
+    networks : callable, optional
+        Returns the networks that were trained for the controller, by file. There is a member of
+        the controller for each of them.
+    random : bool
+        Whether the controller draws random numbers, such as its initial weights.
+    learns : bool
+        Whether the controller learns from run to run.
+    spans : callable, optional
+        Returns the interval in which a search looks for each gain, for a plant. An interval has
+        the value of the smallest and that of the largest magnitude, of the same sign.
+    compared : bool
+        Whether `compare` runs the controller by default.
+    swept : bool
+        Whether `sweep` runs the controller by default.
+    pictured : bool
+        Whether a comparison draws its responses.
+    provenance : mapping
+        Origin of the network of a member, JSON-serialisable; empty if nothing was trained.
+    """
 
     name: str
-    """Its name in options and files."""
     label: str
-    """Its name in tables and pictures."""
     look: tuple[str, str]
-    """Its colour and its marker in pictures: those of relatives are alike."""
     build: Callable[..., Agent]
-    """Returns the controller, from its prior knowledge by name, its gains by name, and a
-    `network` if it has `networks`."""
     prior_knowledge: Sequence[str] = LIMITS
-    """What it knows about the plant: names of arguments of `build`, as in `knowledge`."""
     knows: str = ""
-    """The same in words, for tables."""
     searched: str = ""
-    """What was searched or trained beforehand, and in how many trials and samples, in words."""
     tuned_by: str = ""
-    """The argument of `build`, a time constant in s, that is chosen such that the loop with the
-    nominal plant has an Ms of `sensitivity`; empty if there is none."""
     sensitivity: float = ROBUSTNESS
-    """Ms, the largest magnitude of the loop's sensitivity function; for `tuned_by`."""
     linear: bool = False
-    """Whether it is linear away from the dead zone and the limits; then it has `transfer`."""
     assumes: Sequence[str] = ()
-    """What it takes for granted about the plant: its "direction", or its "scale"."""
     made_for: Mapping[str, Any] = field(default_factory=dict)
-    """The plant of which it assumes this, by the environment's arguments."""
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
-    """The windows that it expects, by the environment's arguments."""
     networks: Callable[[], Mapping[str, Any]] | None = None
-    """Returns the networks that were trained separately, by file: each makes a member."""
     random: bool = False
-    """Whether it draws random numbers itself, such as its first weights."""
     learns: bool = False
-    """Whether it learns from run to run."""
-    spans: Callable[[Parameters], Mapping[str, tuple[float, float]]] | None = None
-    """Returns the values of its gains between which a search on a plant looks, by name: of the
-    smallest and of the largest magnitude, of the same sign."""
+    spans: Callable[[Parameters], plant_scale.Spans] | None = None
     compared: bool = True
-    """Whether `compare` runs it by default."""
     swept: bool = True
-    """Whether `sweep` runs it by default."""
     pictured: bool = False
-    """Whether a comparison draws its responses."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    """Origin of a trained network, JSON-serialisable; empty if nothing was trained."""
 
     def members(self) -> "list[ControllerSpec]":
-        """Return the controller, or one for each of the networks that it was trained to."""
+        """Return the record of a controller with each of the networks, in the order of files.
+
+        Without networks, the list holds this record alone.
+        """
         if self.networks is None:
             return [self]
-        return [
-            replace(
+        members = []
+        for file, network in sorted(self.networks().items()):
+            member = replace(
                 self,
                 build=partial(self.build, network=network),
                 observation=getattr(network, "observation", self.observation),
                 provenance={"file": file, **network.provenance},
                 networks=None,
             )
-            for file, network in sorted(self.networks().items())
-        ]
+            members.append(member)
+        return members
 
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
-        """Return the controller with these arguments of `build` in place of its rule's."""
-        build = partial(self.build, **gains)
+        """Return the record of the controller with these arguments of `build`."""
         tuned_by = "" if self.tuned_by in gains else self.tuned_by
-        return replace(self, build=build, tuned_by=tuned_by)
+        return replace(self, build=partial(self.build, **gains), tuned_by=tuned_by)
 
     def make(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller of `runs` plants with these arguments of the environment."""
+        """Return a controller of a batch of runs; run i uses the seed `seed + i`.
+
+        `plant` has the environment's arguments from which the prior knowledge follows.
+        """
         parameters = Parameters(**{**plant, **self.observation})
-        known = knowledge(self.prior_knowledge, parameters, runs, seed)
+        arguments = knowledge(self.prior_knowledge, parameters, runs, seed)
         if self.tuned_by:
-            known[self.tuned_by] = self.robust_time_constant(plant)
-        return self.build(**known)
+            arguments[self.tuned_by] = self.robust_time_constant(plant)
+        return self.build(**arguments)
 
     def robust_time_constant(self, plant: Mapping[str, Any]) -> float:
-        """Return the value of the argument `tuned_by` with which Ms is `sensitivity`, s."""
+        """Return the value of the argument `tuned_by` with which Ms is `sensitivity`, s.
+
+        `plant` has the environment's arguments. The time constant is rounded to four digits, so
+        that it is the same on all machines.
+        """
         parameters = Parameters(**plant)
-        known = knowledge(self.prior_knowledge, parameters, 1, 0)
+        arguments = knowledge(self.prior_knowledge, parameters, 1, 0)
 
         def build(time_constant: float) -> Any:
-            return self.build(**known, **{self.tuned_by: time_constant})
+            return self.build(**arguments, **{self.tuned_by: time_constant})
 
-        slowest = 30.0 * (known["time_constant"] + known["delay"])
-        fastest = 0.1 * known["sampling_interval"]
+        slowest = 30.0 * (arguments["time_constant"] + arguments["delay"])
+        fastest = 0.1 * arguments["sampling_interval"]
         model = nominal(parameters)
         exact = time_constant_for(self.sensitivity, build, model, slowest, fastest)
-        return float(f"{exact:.4g}")  # the same on all machines
+        return float(f"{exact:.4g}")
 
     def loop(self, plant: Mapping[str, Any]) -> LinearLoop:
-        """Return the loop of the controller, if it is linear, with the nominal plant."""
+        """Return the loop of a linear controller with the nominal plant.
+
+        `plant` has the environment's arguments.
+        """
         controller: Any = self.make(plant, 1, 0)
         return LinearLoop.of(controller, nominal(Parameters(**plant)))
 
     def misfit(self, plant: Parameters) -> str:
-        """Return in a sentence why its errors on a plant say nothing of it; "" if they do."""
-        other = Parameters(**self.made_for)
-        here, there = plant_scale.direction(plant), plant_scale.direction(other)
-        if "direction" in self.assumes and here != there:
+        """Return a sentence that says why the controller does not fit a plant; "" if it fits.
+
+        A controller fits if the plant is like the one that the controller was made for, in what
+        the controller assumes. The errors of one that does not fit say nothing about it.
+        """
+        made_for = Parameters(**self.made_for)
+        direction = plant_scale.direction(plant)
+        expected_direction = plant_scale.direction(made_for)
+        if "direction" in self.assumes and direction != expected_direction:
             sign = {1: "positive", -1: "negative"}
             return (
-                f"{self.label} was made for a plant of {sign[there]} gain. This plant has a "
-                f"{sign[here]} gain, so the loop runs in positive feedback."
+                f"{self.label} was made for a plant of {sign[expected_direction]} gain. This "
+                f"plant has a {sign[direction]} gain, so the loop runs in positive feedback."
             )
-        if "scale" in self.assumes and (difference := plant_scale.difference(plant, other)):
-            return f"{self.label} was made for another plant: {difference}."
+        if "scale" in self.assumes:
+            difference = plant_scale.difference(plant, made_for)
+            if difference:
+                return f"{self.label} was made for another plant: {difference}."
         return ""
 
     def run(
@@ -188,18 +246,32 @@ class ControllerSpec:
         seed: int,
         controller: Agent | None = None,
     ) -> Trajectory:
-        """Run a controller, by default a new one for this plant; see `rollout`."""
+        """Run a controller on a batch of plants.
+
+        Parameters
+        ----------
+        plant
+            The environment's arguments.
+        samples
+            Length of the runs.
+        runs
+            Number of runs.
+        seed
+            Run i has the noise and the set point of the seed `seed + i`.
+        controller
+            The controller of a batch of `runs`; by default, it is made for this plant.
+        """
         agent = controller or self.make(plant, runs, seed)
         arguments = {**plant, **self.observation}
-        if hasattr(agent, "opened"):  # a user's, that acts in its own
+        if hasattr(agent, "opened"):  # A user's policy acts in an environment of its own.
             with agent.opened(samples, **arguments) as plants:
                 return rollout(plants, agent, samples, seed)
         return rollout(make_plants(runs, samples, **arguments), agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller that is ready for plants it was not made for.
+        """Return a controller that is made for a plant, and has learnt on it if it learns.
 
-        A controller that learns has already learnt on the plant it is made for.
+        `plant` has the environment's arguments. The controller is one of a batch of `runs`.
         """
         controller = self.make(plant, runs, seed)
         if self.learns:

@@ -1,9 +1,10 @@
-"""Declare and run the commands `python -m benchmarks.NAME`, and their tasks in parallel.
+"""Declare and run the commands `python -m benchmarks.NAME`, and run their tasks in parallel.
 
-A command is a file, `benchmarks/NAME.py`, or a folder with a `__main__.py`. It has a dataclass
-of options, whose docstrings are the help, and a function `work` that takes these options. The
-function prints its results, returns the closing line, and imports what is slow to import.
-`main = command("NAME", Options, work)` makes the command of the two.
+A command is a file `benchmarks/NAME.py`, or a folder `benchmarks/NAME` with a `__main__.py`. It
+has a dataclass of options, whose docstrings are the help, and a function `work`. The function
+takes the options, writes the results and returns the last line to print. The function also
+imports the packages that are slow to import, so that `--help` is quick.
+`main = command("NAME", Options, work)` makes the command.
 """
 
 import errno
@@ -17,38 +18,40 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn, TypeVar
 
 from benchmarks.lib.errors import UnfinishedError, UsageError
 from benchmarks.lib.provenance import COMMAND_LINE, ROOT
 from benchmarks.lib.results import KeptResults
 
+# The extra of this project that installs a package.
 EXTRAS = {
-    "compare": "cyclopts filelock joblib markdown matplotlib pandas rich scipy tabulate",
-    "data": "h5py minari",
-    "bench": "optuna PIL stable_baselines3",
+    **dict.fromkeys(("cyclopts", "filelock", "joblib", "matplotlib", "pandas"), "compare"),
+    **dict.fromkeys(("rich", "scipy", "tabulate"), "compare"),
+    **dict.fromkeys(("optuna", "PIL", "pygame", "stable_baselines3"), "bench"),
+    **dict.fromkeys(("h5py", "minari"), "data"),
     "ray": "ray",
     "torch": "torch",
 }
-SIGNALS = signal.SIGINT, signal.SIGTERM
+NOTHING_WRITABLE = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EPIPE
 
 
 def stop(error: BaseException, program: str = "python -m benchmarks") -> NoReturn:
-    """Print an error in a sentence and end the program with status 2.
+    """Print an error as a sentence and end the program with status 2.
 
-    If a package is missing, the sentence names the extra that installs it. An import that fails
-    for another reason is a bug, and is raised.
+    If a package is missing, the sentence names the extra that installs it. An `ImportError` for
+    another reason is raised again, since it is a bug.
     """
     message = str(error)
     cause = error.__cause__ or error
-    name = str(getattr(cause, "name", "")).partition(".")[0]
-    extras = [extra for extra, packages in EXTRAS.items() if name in packages.split()]
-    if extras:
-        message = f'{name} is not installed: pip install -e ".[{extras[0]}]" ({cause})'
+    package = str(getattr(cause, "name", "")).partition(".")[0]
+    if package in EXTRAS:
+        extra = EXTRAS[package]
+        message = f'{package} is not installed: pip install -e ".[{extra}]" ({cause})'
     elif isinstance(error, ImportError):
         raise error
     print(f"{program}: error: {message}", file=sys.stderr)
@@ -57,7 +60,7 @@ def stop(error: BaseException, program: str = "python -m benchmarks") -> NoRetur
 
 try:
     from cyclopts import App, CycloptsError
-    from cyclopts import Parameter as Parameter  # for the commands, whose first import this is
+    from cyclopts import Parameter as Parameter  # The commands import it from this module.
     from cyclopts.validators import Number
 except ImportError as _missing:
     stop(_missing)
@@ -68,17 +71,26 @@ Group = TypeVar("Group")
 options: Callable[[type[Group]], type[Group]] = Parameter(name="*")
 
 
-def _strictly(kind: Callable[[str], Any], _type: object, tokens: Sequence[Any]) -> Any:
-    """Read 2.5 not as an integer, which cyclopts would round, and "" not as this folder."""
-    with suppress(ValueError):
-        if value := tokens[0].value:
-            return kind(value)
-    raise ValueError  # for which cyclopts has words
+def _whole_number(_type: object, tokens: Sequence[Any]) -> int:
+    """Return the whole number that a user typed; cyclopts alone would round 2.5 to 2."""
+    typed = tokens[0].value
+    try:
+        return int(typed)
+    except ValueError as error:
+        raise ValueError(f"must be a whole number, got {typed}") from error
+
+
+def _folder(_type: object, tokens: Sequence[Any]) -> Path:
+    """Return the folder that a user typed; cyclopts alone would take "" for this folder."""
+    if not tokens[0].value:
+        raise ValueError("must name a folder")
+    return Path(tokens[0].value)
 
 
 def _integers(least: int, most: int) -> Parameter:
-    whole = partial(_strictly, int)
-    return Parameter(converter=whole, n_tokens=1, validator=Number(gte=least, lte=most))
+    """Return what makes an option accept the integers from `least` to `most` alone."""
+    allowed = Number(gte=least, lte=most)
+    return Parameter(converter=_whole_number, n_tokens=1, validator=allowed)
 
 
 Count = Annotated[int, _integers(1, 1_000_000_000)]
@@ -87,7 +99,7 @@ Seed = Annotated[int, _integers(0, 2**63)]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
 Folder = Annotated[
-    Path, Parameter(help="Folder to write to.", converter=partial(_strictly, Path), n_tokens=1)
+    Path, Parameter(help="The folder to write to.", converter=_folder, n_tokens=1)
 ]
 
 
@@ -101,30 +113,38 @@ def blame(option: str) -> Iterator[None]:
 
 
 def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[str]:
-    """Return the names that an option lists, each once; `UsageError` if one is not known."""
+    """Return the names that an option lists, without repetitions.
+
+    A `UsageError` names the option if a listed name is not among `names`.
+    """
     for name in listed:
         if name not in names:
-            raise UsageError(f"{option}: no {name!r}; there are {', '.join(names)}")
+            raise UsageError(f"{option}: there is no {name!r}; choose from {', '.join(names)}")
     return list(dict.fromkeys(listed))
 
 
-def _typed(default: object) -> str | None:
-    """Return a default as a user would type it; None if it is not worth showing."""
+def _default_as_typed(default: object) -> str | None:
+    """Return a default as a user would type it; None hides it in the help."""
     if default is None or default is False or default == ():
         return None
-    return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
+    if isinstance(default, tuple):
+        return " ".join(map(str, default))
+    return str(default)
 
 
 def read(declared: type[Group], program: str, words: Sequence[str]) -> Group | None:
-    """Read a command line into options; with --help, print the help and return None.
+    """Read the words of a command line into options.
 
-    An invalid option is a `UsageError`.
+    With `--help`, the help is printed and None is returned. An invalid option raises a
+    `UsageError`.
     """
     app = App(
         name=program,
         help=inspect.getdoc(declared),
         version_flags=[],
-        default_parameter=Parameter(negative=(), allow_repeating=True, show_default=_typed),
+        default_parameter=Parameter(
+            negative=(), allow_repeating=True, show_default=_default_as_typed
+        ),
         result_action="return_value",
     )
     app["--help"].show = False
@@ -139,31 +159,23 @@ def read(declared: type[Group], program: str, words: Sequence[str]) -> Group | N
 def command(
     name: str, declared: type[Group], work: Callable[[Group], str]
 ) -> Callable[..., int]:
-    """Return the `main` of the command `python -m benchmarks.NAME`.
+    """Return the function `main` of the command `python -m benchmarks.NAME`.
 
-    It takes the command line without the program's name, by default that of the process, and
-    returns the exit status of `finish`.
+    `main` takes the words of the command line after the program's name, by default those of
+    this process, and returns the exit status of `finish`.
     """
     program = f"python -m benchmarks.{name}"
 
     def main(arguments: Sequence[str] | None = None) -> int:
-        words = sys.argv[1:] if arguments is None else arguments
-        token = COMMAND_LINE.set(shlex.join(["python", "-m", f"benchmarks.{name}", *words]))
-        os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever the shell has set
-        for stream in (sys.stdout, sys.stderr):
-            if hasattr(stream, "reconfigure"):
-                stream.reconfigure(errors="replace")  # for "°C" on an ASCII terminal
-        for number in SIGNALS:
-            if arguments is None and signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, _interrupt)
+        words = sys.argv[1:] if arguments is None else list(arguments)
+        if arguments is None:  # This process runs the command alone.
+            _interrupt_on_signals()
 
         def read_and_work() -> str:
             chosen = read(declared, program, words)
-            closing_line = "" if chosen is None else work(chosen)
-            if arguments is None:  # the process ends: nothing is left to be interrupted
-                _ignore_signals()
-            return closing_line
+            return "" if chosen is None else work(chosen)
 
+        token = COMMAND_LINE.set(shlex.join([*program.split(), *words]))
         try:
             return finish(read_and_work, program)
         finally:
@@ -175,160 +187,191 @@ def command(
 def finish(work: Callable[[], str], program: str) -> int:
     """Do work, print the line that it returns, and return the exit status.
 
-    This is 0 for success; 1 if tasks failed, a file could not be written or memory ran out; 130
-    after Ctrl-C and 143 after SIGTERM. An invalid option or a missing package ends the program
-    with 2.
+    The status is 0 for success; 1 if tasks failed, memory ran out, or nothing more could be
+    written; 130 after Ctrl-C and 143 after SIGTERM. An invalid option or a missing package ends
+    the program with status 2.
     """
     try:
-        if closing_line := work():
+        closing_line = work()
+        if closing_line:
             print(closing_line, flush=True)
-    except KeyboardInterrupt as stopped:
+        return 0
+    except KeyboardInterrupt as interrupt:
         print("\nInterrupted.", flush=True)
-        return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
-    except (UnfinishedError, MemoryError) as error:
-        print(str(error) or "There is not enough memory for so many runs or samples.")
-        return 1
+        number = interrupt.args[0] if interrupt.args else signal.SIGINT
+        return 128 + int(number)
+    except UnfinishedError as error:
+        print(error)
+    except MemoryError:
+        print("There is not enough memory for so many runs or samples.")
     except (UsageError, ImportError) as error:
         stop(error, program)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EPIPE):
-            raise  # it is no full disk, and no reader that has gone
-        print(f"{program}: the output is cut off: {error.strerror}", file=sys.stderr)
-        # What is left is flushed at exit.
+        if error.errno not in NOTHING_WRITABLE:
+            raise
+        print(f"{program}: nothing more can be written: {error.strerror}", file=sys.stderr)
+        # Python writes the rest of its output at exit, which would raise the error again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    return 0
+    return 1
 
 
-def _ignore_signals() -> None:
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+def _interrupt_on_signals() -> None:
+    """Make the first Ctrl-C or SIGTERM raise a KeyboardInterrupt in this process.
 
+    Later signals are ignored, while the command writes what has finished. A signal that the
+    shell made this process ignore stays ignored.
+    """
+    signals = [
+        number
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) is not signal.SIG_IGN
+    ]
 
-def _interrupt(number: int, _frame: object) -> NoReturn:
-    """Raise KeyboardInterrupt; later signals are ignored while what has finished is written."""
-    _ignore_signals()
-    raise KeyboardInterrupt(number)
+    def interrupt(number: int, _frame: object) -> NoReturn:
+        for later in signals:
+            signal.signal(later, signal.SIG_IGN)
+        raise KeyboardInterrupt(number)
+
+    for number in signals:
+        signal.signal(number, interrupt)
 
 
 Task = Callable[[], Any]
-Answer = tuple[str, Any, str]  # the name of a task, its result, and its error or ""
+
+
+class Answer(NamedTuple):
+    """The outcome of a task: its result, or its error as text, "" if it succeeded."""
+
+    task: str
+    result: Any
+    error: str
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class FanOut:
-    """Where tasks run, by joblib, and how many at once. With one job they run in this process.
+    """Where joblib runs tasks, and how many run at once. A single job runs in this process.
 
-    A result depends on neither, as long as all randomness of a task comes from its arguments.
+    The result of a task does not depend on these options, as long as all randomness of the task
+    comes from its arguments.
     """
 
     jobs: Count | None = None
-    """Number of tasks run at once (default: one per core)."""
+    """The number of tasks that run at once (default: one per core)."""
     backend: Literal["loky", "ray"] = "loky"
-    """Where tasks run: loky for this machine, ray for the Ray cluster at RAY_ADDRESS."""
+    """Where tasks run: loky is this machine, and ray is the Ray cluster at RAY_ADDRESS."""
 
     def stream(
-        self, tasks: Mapping[str, Task], title: str = "", kept: KeptResults | None = None
+        self, tasks: Mapping[str, Task], title: str = "", store: KeptResults | None = None
     ) -> Iterator[tuple[str, Any]]:
-        """Run tasks, and yield the name and result of each as it finishes; on Ray, at the end.
+        """Run tasks, and yield the name and the result of a task as soon as it has finished.
 
-        Tasks are functions without arguments, by name, such as a `functools.partial` of a
-        function of a module. Results that are kept already are yielded first. A progress bar
-        has the title, if there is one. `UnfinishedError`, at the end, says what went wrong.
+        Parameters
+        ----------
+        tasks
+            Functions without arguments by name, such as a `functools.partial` of a function of
+            a module. On a Ray cluster, all results come at the end.
+        title
+            Title of the progress bar; "" for no progress bar.
+        store
+            Results of an earlier run of the same tasks, which are yielded first. New results
+            are added to the store.
+
+        Raises
+        ------
+        UnfinishedError
+            If tasks failed, after all other tasks have finished. The message names the failed
+            tasks and their errors.
         """
-        missing, errors = dict(tasks), {}
+        missing: dict[str, Task] = {}
+        errors: dict[str, str] = {}
         with progress_bar(title, len(tasks)) as advance:
-            for name in tasks:
-                result = kept.load(name) if kept else None
-                if result is not None:
-                    del missing[name]
-                    advance()
-                    yield name, result
-            for name, result, error in self._answers(missing):
-                advance()
-                if error:
-                    errors[name] = error
+            for name, task in tasks.items():
+                result = store.load(name) if store else None
+                if result is None:
+                    missing[name] = task
                     continue
-                if kept:
-                    kept.save(name, result)
+                advance()
                 yield name, result
+            for answer in self._answers(missing):
+                advance()
+                if answer.error:
+                    errors[answer.task] = answer.error
+                    continue
+                if store:
+                    store.save(answer.task, answer.result)
+                yield answer.task, answer.result
         if errors:
             raise UnfinishedError(_summary(errors, len(tasks)))
 
     def _answers(self, tasks: Mapping[str, Task]) -> Iterator[Answer]:
-        """Run tasks, and yield each answer as it comes."""
-        import joblib  # here: slow to import
-        from joblib.externals.loky.process_executor import TerminatedWorkerError
+        """Run tasks, and yield their answers in the order in which they come."""
+        import joblib  # imported here, as it is slow to import
 
+        calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
         if self.backend == "ray":
-            _connect()
-            calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
+            _connect_to_ray()
             with joblib.parallel_config("ray", n_jobs=self.jobs or -1):
                 yield from joblib.Parallel()(calls)
             return
-        process = os.getpid()
-        calls = [joblib.delayed(_attempt)(name, task, process) for name, task in tasks.items()]
         jobs = max(1, min(self.jobs or joblib.cpu_count(), len(calls)))
+        with joblib.parallel_config(
+            "loky",
+            inner_max_num_threads=1,
+            initializer=_prepare_worker,
+            initargs=(os.getpid(),),
+        ):
+            parallel = joblib.Parallel(jobs, return_as="generator_unordered", batch_size=1)
         try:
-            with joblib.parallel_config("loky", inner_max_num_threads=1):
-                parallel = joblib.Parallel(jobs, return_as="generator_unordered", batch_size=1)
-                with _processes_that_ignore(signal.SIGINT):
-                    answers: Iterator[Answer] = parallel(calls)
+            with _ctrl_c_ignored():  # The processes that start here ignore Ctrl-C, too.
+                answers = parallel(calls)
             yield from answers
-        except TerminatedWorkerError as error:
+        except BrokenProcessPool as error:
             raise UnfinishedError(
-                "a process was killed, perhaps for lack of memory: try fewer --jobs"
+                "a process was killed, perhaps because memory ran out: try fewer --jobs"
             ) from error
 
 
-def _summary(errors: Mapping[str, str], tasks: int) -> str:
-    """Return a text about errors, by task: each kind once, and the first with its traceback."""
-    summary = [f"{len(errors)} of {tasks} tasks failed; the others are done"]
-    first_of_kind: dict[str, str] = {}
-    for name, text in errors.items():
-        first_of_kind.setdefault(text.splitlines()[-1], name)
-    for last_line, name in list(first_of_kind.items())[:20]:
-        summary.append(f"{name}: {last_line}")
-    return "\n".join([*summary, next(iter(errors.values()))])
-
-
 @contextmanager
-def _processes_that_ignore(number: int) -> Iterator[None]:
-    """Start processes that ignore a signal, such as Ctrl-C, on which this process ends them.
-
-    Only the main thread can ask for that. Those of another thread ignore it from their first
-    task on.
-    """
-    before = signal.getsignal(number)
-    if threading.current_thread() is not threading.main_thread() or before is None:
+def _ctrl_c_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C in this process; Python allows that in its main thread alone."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    signal.signal(number, signal.SIG_IGN)
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.signal(number, before)
+        signal.signal(signal.SIGINT, handler)
 
 
-def _attempt(name: str, task: Task, parent: int = 0) -> Answer:
-    """Run a task, and return its error as text, since not every exception can be pickled.
-
-    `parent` is the process that started the one of this task; 0 on a cluster.
-    """
-    if parent not in (0, os.getpid()):
-        _prepare_process(parent)
+def _attempt(name: str, task: Task) -> Answer:
+    """Run a task, and return its error as text, since not every exception can be pickled."""
     try:
-        return name, task(), ""
-    except UsageError as error:  # a sentence, of a user's own controller
-        return name, None, str(error)
+        return Answer(name, task(), "")
+    except UsageError as error:  # The message is for the user, who needs no traceback.
+        return Answer(name, None, str(error))
     except (Exception, SystemExit):
-        return name, None, traceback.format_exc().strip()
+        return Answer(name, None, traceback.format_exc().strip())
 
 
-@cache
-def _prepare_process(parent: int) -> None:
-    """Make this process ignore Ctrl-C, and end when the process that started it is gone."""
+def _summary(errors: Mapping[str, str], tasks: int) -> str:
+    """Return a text about the errors of some of the tasks, with the first one as a whole.
+
+    `errors` are texts by the name of the task. The last line of a text names the error.
+    """
+    lines = [f"{len(errors)} of {tasks} tasks failed; the other tasks have finished"]
+    for name, text in list(errors.items())[:20]:
+        lines.append(f"{name}: {text.splitlines()[-1]}")
+    lines.append(next(iter(errors.values())))
+    return "\n".join(lines)
+
+
+def _prepare_worker(parent: int) -> None:
+    """Make this worker process ignore Ctrl-C, and end when the process `parent` has ended.
+
+    On Ctrl-C, which a terminal sends to all processes, the parent ends its workers.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def end_with_parent() -> None:
@@ -341,30 +384,35 @@ def _prepare_process(parent: int) -> None:
 
 @contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show a progress bar on a terminal, and yield what moves it on by one task."""
+    """Show a progress bar on a terminal, and yield a function that adds a finished task.
+
+    Nothing is shown if `title` is "". `total` is the number of tasks.
+    """
     from rich.console import Console
     from rich.progress import Progress
 
-    console, hidden = Console(stderr=True), not (title and sys.stderr.isatty())
-    with Progress(console=console, transient=True, disable=hidden) as progress:
+    hidden = not (title and sys.stderr.isatty())
+    with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:
         bar = progress.add_task(title, total=total)
         yield lambda: progress.advance(bar)
 
 
-def _connect() -> None:
-    """Connect to the cluster at RAY_ADDRESS, or the one that was started on this machine.
+def _connect_to_ray() -> None:
+    """Connect to the Ray cluster at RAY_ADDRESS, by default the one on this machine.
 
-    Ray brings the checkout to its nodes, which need the packages that a task imports.
+    Ray copies the checkout to its nodes. A `UsageError` is raised if no cluster can be reached.
     """
-    import ray  # here: an optional package that takes a second to import
+    import ray  # imported here, as it is optional and slow to import
     from ray.util.joblib import register_ray
 
     register_ray()
-    stays = "/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py", "published", "*.md"
+    # The tasks need the code alone: the patterns with "!" make exceptions from the first one.
+    excluded = ["/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py"]
+    excluded += ["published", "*.md"]
     try:
         ray.init(
             address=os.environ.get("RAY_ADDRESS", "auto"),
-            runtime_env={"working_dir": str(ROOT), "excludes": [*stays]},
+            runtime_env={"working_dir": str(ROOT), "excludes": excluded},
             ignore_reinit_error=True,
             log_to_driver=False,
         )

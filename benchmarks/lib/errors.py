@@ -1,13 +1,13 @@
-"""The errors that commands turn into a sentence."""
+"""The errors that a command prints as a sentence."""
 
 
 class UsageError(ValueError):
-    """An option that does not fit, named by the message: the exit status is 2."""
+    """An option is invalid, as the message says; the exit status of the command is 2."""
 
 
 class UnfinishedError(RuntimeError):
-    """A command could not do all of its work, or write a file: the exit status is 1."""
+    """A command could not do all of its work; its exit status is 1."""
 
 
 class NoBoundError(ValueError):
-    """A kind of bound does not exist for a case, such as a reference that never settles."""
+    """A scenario has no bound of a kind, such as a reference if the plant never settles."""

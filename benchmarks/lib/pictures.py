@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from benchmarks.lib.storage import replacing
-
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
@@ -27,7 +25,7 @@ if TYPE_CHECKING:
 
 COLOURS = "#0072B2", "#D55E00"  # of lines that stand for no controller
 WIDTH = 7.5  # of a picture, inches
-TITLE_CHARACTERS = 90  # that fit on a line of a title
+TITLE_CHARACTERS = 90  # on a line of a title
 PALETTE = 128  # colours of a saved picture; fewer make the file smaller
 STYLE: Any = {
     "axes.grid": True,
@@ -66,36 +64,47 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
     Parameters
     ----------
     path : Path
-        The file. It is written completely or not at all.
+        The file.
     height : float
         Height of the picture, inches. The width is `WIDTH`.
     title : str
         A sentence, which is broken into lines.
     """
-    import matplotlib as mpl  # here: slow to import, and many reports have no picture
+    from matplotlib import rc_context  # imported here, as it is slow
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from PIL import Image
 
-    with mpl.rc_context(STYLE):
+    with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, height))
         sentence = textwrap.fill(title[0].upper() + title[1:], TITLE_CHARACTERS)
         figure.suptitle(sentence, x=0.015, ha="left", fontsize=10, weight="bold")
         yield figure
-        with replacing(path) as partial_file:
-            figure.savefig(partial_file)
-            picture = Image.open(partial_file).convert("RGB")
-            # The clustering keeps the colours of small marks.
-            smaller = picture.quantize(PALETTE, Image.Quantize.MAXCOVERAGE, kmeans=3)
-            smaller.save(partial_file)
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.draw()  # `Figure.savefig` would draw twice because of the layout.
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    picture.quantize(PALETTE, Image.Quantize.FASTOCTREE).save(path)
 
 
 @dataclass(frozen=True)
 class Panels:
-    """A figure with a panel for each of several names, in rows."""
+    """A figure with a panel for each of several names, in rows.
+
+    Attributes
+    ----------
+    figure : Figure
+        The figure.
+    axes : sequence of Axes
+        The panels, one for each name.
+    unused : sequence of Axes
+        The empty places at the end of the last row.
+    columns : int
+        Number of panels in a full row.
+    """
 
     figure: Figure
-    axes: Sequence[Axes]  # one for each name
-    unused: Sequence[Axes]  # the empty places at the end of the last row
+    axes: Sequence[Axes]
+    unused: Sequence[Axes]
     columns: int
 
     def label_edges(self, x: str, y: str) -> None:
@@ -108,7 +117,7 @@ class Panels:
     def add_legend(self, entries: Mapping[str, Artist], columns: int) -> None:
         """Put a legend in the unused places of the last row, or else below all panels.
 
-        `entries` holds an artist for each text. A legend below has `columns` columns.
+        `entries` has an artist for each text. A legend below the panels has `columns` columns.
         """
         handles = list(entries.values())
         texts = list(entries)

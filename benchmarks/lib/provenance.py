@@ -1,4 +1,4 @@
-"""Tell where results are from: the command line, the code and the versions of packages."""
+"""Return the provenance of results: the command line, the code and the versions of packages."""
 
 import hashlib
 import platform
@@ -11,18 +11,17 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent.parent  # the checkout
+ROOT = Path(__file__).resolve().parents[2]  # the checkout
 CODE_FOLDERS = "mptc_gym", "agents", "benchmarks"
 CODE_SUFFIXES = {".py", ".npz", ".json"}  # with trained networks and the bounds of the package
 PACKAGES = "gymnasium", "numpy", "optuna", "scipy", "stable_baselines3", "torch"
 
-# The command line that is being run, as it can be typed. Every command sets it, and it is empty
-# where a function is called from Python.
+# The command line of the command that runs, as a user can type it; "" if no command runs.
 COMMAND_LINE: ContextVar[str] = ContextVar("COMMAND_LINE", default="")
 
 
 def origin() -> dict[str, Any]:
-    """Return the provenance of results that are made now, JSON-serialisable."""
+    """Return the provenance of results that are computed now, JSON-serialisable."""
     return {
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "command": COMMAND_LINE.get(),
@@ -34,7 +33,7 @@ def origin() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that affect a result."""
-    import mptc_gym  # here: Gymnasium and NumPy are slow to import
+    import mptc_gym  # imported here, as Gymnasium is slow to import
 
     installed = {"python": platform.python_version(), "mptc_gym": mptc_gym.__version__}
     for package in PACKAGES:
@@ -45,22 +44,21 @@ def versions() -> dict[str, str]:
 
 @cache
 def commit() -> str:
-    """Return the checkout's commit, with "-dirty" if files differ from it.
+    """Return the commit of the checkout, with "-dirty" after it if files differ from it.
 
-    It is "" without git, and where the checkout is no repository itself: a folder that was
-    unpacked in another repository has nothing to do with the commit of that.
+    The result is "" without git, and if the checkout is not a repository.
     """
-    if not (ROOT / ".git").exists():
+    if not (ROOT / ".git").exists():  # git would look for a repository around it.
         return ""
     command = ["git", "status", "--porcelain=v2", "--branch"]
     try:
         status = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return ""
-    first, *others = status.stdout.splitlines()  # "# branch.oid NAME", more of it, and files
-    if all(line.startswith("#") for line in others):
-        return first.split()[-1]
-    return first.split()[-1] + "-dirty"
+    lines = status.stdout.splitlines()
+    identifier = lines[0].split()[-1]  # of "# branch.oid COMMIT"
+    is_clean = all(line.startswith("#") for line in lines)  # The other lines name files.
+    return identifier if is_clean else f"{identifier}-dirty"
 
 
 @cache

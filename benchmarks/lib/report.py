@@ -1,14 +1,11 @@
-"""Write a report as Markdown, and as one HTML page with its pictures; print its tables."""
+"""Write a report in Markdown with its pictures, and print its tables."""
 
 from __future__ import annotations
 
-import base64
-import html
-import re
 import shutil
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,30 +13,30 @@ import pandas as pd
 
 from benchmarks.lib.storage import write_text
 
-_HEAD = """\
-<!doctype html><html lang="en">
-<meta charset="utf-8"><meta name="viewport" content="width=device-width"><style>
-:root { color-scheme: light dark; }
-body { font-family: sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem;
-       color: light-dark(#222, #ddd); background: light-dark(#fff, #181818); line-height: 1.4; }
-table { border-collapse: collapse; font-size: 0.9rem; display: block; overflow-x: auto; }
-th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #8885; }
-th:first-child, td:first-child { text-align: left; }
-img { max-width: 100%; }
-</style>"""
-
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a report. Its texts are plain: nothing in them is read as Markdown."""
+    """A section of a report. Its texts are shown as they are, not read as Markdown.
 
-    title: str  # "" for none
-    text: Sequence[str] = ()  # paragraphs
-    table: pd.DataFrame | None = None  # of text
-    _: KW_ONLY
-    bold: Collection[str] = ()  # cells that are shown in bold type
-    # PNG files in the report's folder, and for each what it shows, in a sentence.
-    pictures: Mapping[str, str] = field(default_factory=dict)
+    Attributes
+    ----------
+    title : str
+        The heading; "" for none.
+    text : sequence of str
+        Paragraphs.
+    table : pandas.DataFrame, optional
+        A table of texts.
+    bold : collection of str
+        Cells of the table that are shown in bold type.
+    pictures : mapping
+        The captions of PNG files, by their names in the report's folder.
+    """
+
+    title: str
+    text: Sequence[str] = ()
+    table: pd.DataFrame | None = None
+    bold: Collection[str] = field(default=(), kw_only=True)
+    pictures: Mapping[str, str] = field(default_factory=dict, kw_only=True)
 
 
 def write_report(
@@ -49,92 +46,93 @@ def write_report(
     origin: Mapping[str, Any],
     printed: int | None = None,
 ) -> None:
-    """Write `report.md` and `report.html`, and print the first `printed` sections, or all.
+    """Write `report.md`, and print its first sections.
 
-    The first line says what is missing, if `origin` has the key "missing"; the last line is the
-    time, the commit and the command line.
+    Parameters
+    ----------
+    folder
+        The folder of the report and its pictures. A picture that is missing is left out.
+    title
+        The heading of the report.
+    sections
+        The parts of the report.
+    origin
+        The provenance of the results, as `provenance.origin` returns it. If it has the key
+        "missing", the first line of the report says that these results are missing.
+    printed
+        Number of sections to print; None prints all.
     """
     unfinished = f"Unfinished: {origin['missing']}." if "missing" in origin else ""
-    page = _page(folder, title, sections, origin, unfinished)
-    write_text(folder / "report.md", page)
-    write_text(folder / "report.html", _html(folder, title, page))
+    page = [f"# {escape(title)}"]
     if unfinished:
+        page.append(f"**{escape(unfinished)}**")
         print(unfinished)
-    width = shutil.get_terminal_size((150, 24)).columns
+    for section in sections:
+        page += _in_markdown(section, folder)
+    page.append(f"{escape(_source(origin))}\n")
+    write_text(folder / "report.md", "\n\n".join(page))
     for section in sections[:printed]:
-        for text in filter(None, [section.title, *section.text]):
-            print(textwrap.fill(text, width))
-        if section.table is not None:
-            print(on_screen(section.table))
+        _print(section)
+
+
+def _in_markdown(section: Section, folder: Path) -> list[str]:
+    """Return the blocks of a section in Markdown, with the pictures that are in the folder."""
+
+    def cell(text: object) -> str:
+        escaped = escape(text)
+        return f"**{escaped}**" if text in section.bold else escaped
+
+    blocks = []
+    if section.title:
+        blocks.append(f"## {escape(section.title)}")
+    blocks += [escape(text) for text in section.text]
+    if section.table is not None:
+        cells = section.table.astype(object).map(cell).rename(columns=escape)
+        blocks.append(str(cells.to_markdown(index=False, disable_numparse=True)))
+    for name, caption in section.pictures.items():
+        if (folder / name).exists():
+            blocks.append(f"![{escape(caption)}]({name})")
+    return blocks
 
 
 def escape(text: object) -> str:
     """Return Markdown, on one line, that shows a text as it is.
 
-    A text may come from outside: the name of a controller, of a file or of a column. Without
-    this it could end a cell of a table, or bring tags and links into the page.
+    The name of a controller, a file or a column comes from outside. Without this function it
+    could end a cell of a table, or bring HTML and links into the page.
     """
     escaped = " ".join(str(text).split()).replace("\\", "\\\\")
     escaped = escaped.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     escaped = escaped.replace("|", "\\|").replace("](", "]\\(")
-    for pair in "*_`":  # which have a meaning if they enclose something
-        if escaped.count(pair) > 1:
-            escaped = escaped.replace(pair, f"\\{pair}")
+    for mark in "*_`":  # A single mark has no meaning, two enclose a text.
+        if escaped.count(mark) > 1:
+            escaped = escaped.replace(mark, f"\\{mark}")
     return escaped
 
 
-def _page(
-    folder: Path,
-    title: str,
-    sections: Sequence[Section],
-    origin: Mapping[str, Any],
-    unfinished: str,
-) -> str:
-    """Return a report in Markdown, with the pictures that are in the folder."""
-    parts = [f"# {escape(title)}"]
-    if unfinished:
-        parts.append(f"**{escape(unfinished)}**")
-    for section in sections:
-        if section.title:
-            parts.append(f"## {escape(section.title)}")
-        parts += map(escape, section.text)
-        if section.table is not None:
-            parts.append(_table(section.table, section.bold))
-        for name, caption in section.pictures.items():
-            if (folder / name).exists():
-                parts.append(f"![{escape(caption)}]({name})")
-    commit = origin["commit"]  # a hash of 40 digits, possibly with "-dirty", or ""
+def _source(origin: Mapping[str, Any]) -> str:
+    """Return when, with which code and by which command results were made, in a line."""
+    commit = origin["commit"]  # a hash of 40 digits, "-dirty" after it or not; or ""
     version = f"commit {commit[:12]}{commit[40:]}" if commit else f"code {origin['code'][:12]}"
     command = origin["command"] or "called from Python"
-    parts.append(f"{origin['started']}, {version}: {escape(command)}\n")
-    return "\n\n".join(parts)
+    return f"{origin['started']}, {version}: {command}"
 
 
-def _table(table: pd.DataFrame, bold: Collection[str]) -> str:
-    """Return a table of text in Markdown."""
-
-    def cell(text: object) -> str:
-        return f"**{escape(text)}**" if text in bold else escape(text)
-
-    shown = table.astype(object).map(cell).rename(columns=escape)
-    return str(shown.to_markdown(index=False, disable_numparse=True))
-
-
-def _html(folder: Path, title: str, page: str) -> str:
-    """Return a page of Markdown as one file of HTML, with the pictures in it."""
-    import markdown
-
-    body = markdown.markdown(page, extensions=["tables", "toc"])
-    for name in re.findall(r'src="([\w.-]+\.png)"', body):
-        data = base64.b64encode((folder / name).read_bytes()).decode()
-        body = body.replace(f'src="{name}"', f'src="data:image/png;base64,{data}"')
-    return f"{_HEAD}<title>{html.escape(title)}</title>\n{body}\n</html>\n"
+def _print(section: Section) -> None:
+    """Print a section without its pictures."""
+    width = shutil.get_terminal_size((150, 24)).columns
+    for text in (section.title, *section.text):
+        if text:
+            print(textwrap.fill(text, width))
+    if section.table is not None:
+        print(on_screen(section.table))
 
 
 def on_screen(table: pd.DataFrame) -> str:
-    """Return a table of text for the terminal, or as wide as COLUMNS says.
+    """Return a table of texts as lines that are no wider than the terminal.
 
-    Nothing is cut: columns that find no room follow below, beside the first column again.
+    If the columns do not fit on a line, the table is broken into blocks below each other, which
+    all begin with the first column.
     """
     width = shutil.get_terminal_size((150, 24)).columns
     first = table.columns[0]

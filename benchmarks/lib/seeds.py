@@ -1,8 +1,8 @@
-"""The table of seeds: each purpose has a block of its own.
+"""The table of seeds: each purpose has a block of seeds.
 
-An episode of the environment follows from its seed. So results on one block say nothing about
-another block, and what was chosen on one is measured on another. Bootstraps and designs of
-plants have generators of their own, with seeds from 0 on, which draw no episode.
+An episode of the environment follows from its seed. Blocks do not overlap, so controllers are
+never measured in the episodes on which they were trained or chosen. Bootstraps and designs of
+plants draw no episode; the seeds of their generators start at 0.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from mptc_gym import evaluation
 
 @dataclass(frozen=True)
 class Block:
-    """Seeds that follow each other, from `first` on."""
+    """A number of consecutive seeds from `first` on, and their purpose."""
 
     first: int
     count: int
@@ -37,7 +37,11 @@ SEEDS = {
         evaluation.VALIDATION_EPISODES,
         "episodes to choose policies by, with bounds in the package",
     ),
+    "trials": Block(
+        6_200_000, 300_000, "episodes to try settings of the self-tuning controllers on"
+    ),
     "published": Block(evaluation.SEED, 100_000, "episodes of published results"),
     "data sets": Block(9_000_000, 100_000, "episodes that data sets hold"),
+    "check": Block(31_000_000, 1_000, "episodes that check the final networks, once"),
     "training": Block(1 << 32, 1 << 32, "episodes of the plants that policies are trained on"),
 }

@@ -1,20 +1,20 @@
-"""Estimate quantities from several runs, with 95 % confidence intervals, and percentiles."""
+"""Estimate quantities from several runs: means, shares and quantiles with their intervals."""
 
 import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy  # loads its modules on first use
+import scipy  # SciPy loads its modules on first use.
 from numpy.typing import ArrayLike, NDArray
 
-ENDS = 0.025, 0.975  # quantiles at the ends of an interval; 95 % is SciPy's default, too
-RESAMPLES = 2000  # bootstrap resamples
+ENDS = 0.025, 0.975  # quantiles at the ends of a 95 % interval, as in SciPy
+RESAMPLES = 2000  # of a bootstrap
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its 95 % confidence interval from `low` to `high`, from `runs` runs."""
+    """A value with its 95 % confidence interval from `low` to `high`, from a number of runs."""
 
     value: float
     low: float
@@ -22,11 +22,14 @@ class Estimate:
     runs: int
 
     def scaled(self, factor: float) -> "Estimate":
-        """Return this estimate, and both ends of its interval, times a positive factor."""
+        """Return the estimate with its value and both ends times a positive factor."""
         return Estimate(factor * self.value, factor * self.low, factor * self.high, self.runs)
 
     def __format__(self, form: str) -> str:
-        """Return "value (low to high)"; the value alone if nothing was random."""
+        """Return "value (low to high)" in a format; the value alone if the ends are equal.
+
+        An interval without an upper end is written as "value (one run)".
+        """
         value = written(self.value, form)
         low = written(self.low, form)
         high = written(self.high, form)
@@ -38,7 +41,7 @@ class Estimate:
 
 
 def written(value: float, form: str) -> str:
-    """Return a number as text in a format, but never -0."""
+    """Return a number as text in a format, without the sign of a -0."""
     text = format(value, form)
     if set(text) <= set("-0."):
         return text.lstrip("-")
@@ -46,9 +49,9 @@ def written(value: float, form: str) -> str:
 
 
 def student(values: ArrayLike) -> Estimate:
-    """Estimate the mean over runs, shape (runs,), with Student's t interval.
+    """Estimate the mean of values, one a run, with the interval of Student's t distribution.
 
-    A single run, or equal values, give an interval of zero width.
+    The interval of a single value, or of equal values, has zero width.
     """
     numbers = np.asarray(values, dtype=np.float64)
     mean = float(numbers.mean())
@@ -62,10 +65,11 @@ def student(values: ArrayLike) -> Estimate:
 
 
 def quantile(values: ArrayLike, probability: float) -> Estimate:
-    """Estimate a quantile over runs, shape (runs,).
+    """Estimate a quantile of values, one a run.
 
-    The interval of `scipy.stats.quantile_test` is used. Its ends are two of the ordered values,
-    or infinite if there are too few runs. It assumes nothing about their distribution.
+    The interval is that of `scipy.stats.quantile_test`. The ends of the interval are two of the
+    ordered values, or infinite if there are too few runs. The interval assumes nothing about
+    the distribution of the values.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     value = percentiles(ordered, value=100.0 * probability)["value"]
@@ -80,7 +84,10 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
 
 
 def share(happened: NDArray[np.bool_]) -> Estimate:
-    """Estimate the share of runs in which something happened, with Wilson's interval."""
+    """Estimate the share of runs in which an event happened, with Wilson's interval.
+
+    `happened` tells for each run whether the event happened, shape (runs,).
+    """
     count = int(happened.sum())
     runs = len(happened)
     interval = scipy.stats.binomtest(count, runs).proportion_ci(method="wilson")
@@ -88,18 +95,19 @@ def share(happened: NDArray[np.bool_]) -> Estimate:
 
 
 def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
-    """Estimate the mean over the runs of one or more tasks, by a percentile bootstrap.
+    """Estimate the mean of values over tasks, members and runs, by a percentile bootstrap.
 
-    Tasks have the same shape: (runs,), or (members, runs) for several trained controllers in
-    the same runs. Members share the noise of a run, so members and runs are resampled
-    independently, and a resample takes every crossing of the two (A. B. Owen, "The pigeonhole
-    bootstrap", Annals of Applied Statistics 1, 2007, 386-411). With only five members that
-    differ far more than runs do, its coverage is 82 %.
+    Each task is an array of values of the same shape: (runs,), or (members, runs) for several
+    trained networks in the same runs. Tasks are not resampled. The members share the noise of a
+    run, so members and runs are resampled independently, and a resample takes every pair of a
+    member and a run (A. B. Owen, "The pigeonhole bootstrap", Annals of Applied Statistics 1,
+    2007, 386-411). With only five members that differ far more than runs do, the interval holds
+    the true mean in 82 % of the cases.
     """
     tables = [np.atleast_2d(np.asarray(task, dtype=np.float64)) for task in tasks]
     all_values = np.concatenate([table.ravel() for table in tables])
     mean = float(all_values.mean())
-    if all(np.ptp(table) == 0.0 for table in tables):  # nothing was random
+    if all(np.ptp(table) == 0.0 for table in tables):  # Nothing was random.
         return Estimate(mean, mean, mean, all_values.size)
     generator = np.random.default_rng(seed)
     members, runs = tables[0].shape
@@ -115,11 +123,17 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
 def percentiles(
     values: NDArray[np.float64], method: Any = "linear", **percents: float
 ) -> dict[str, Any]:
-    """Return percentiles along the last axis, by the names that they are given.
+    """Return percentiles of values along their last axis, by name.
 
-    By default they are `median`, `p10` and `p90`. `method` is that of `numpy.percentile`, for
-    finite values. Infinite values, such as the time of a run that never settles, cannot be
-    interpolated: then the next higher value is used.
+    Parameters
+    ----------
+    values
+        Values, shape (..., runs).
+    method
+        The method of `numpy.percentile`. If some values are infinite, such as the time of a run
+        that never settles, the method is "higher", since these cannot be interpolated.
+    percents
+        Percentages by name; by default `median`, `p10` and `p90`.
     """
     if not np.isfinite(values).all():
         method = "higher"

@@ -11,7 +11,6 @@ from benchmarks.lib.command import Count, FanOut, Folder, Parameter, command, op
 from benchmarks.lib.errors import UsageError
 from benchmarks.lib.results import KeptResults, conditions_of, results_folder
 from benchmarks.lib.seeds import SEEDS
-from benchmarks.lib.storage import replacing
 from benchmarks.loop.scenarios import PlantOptions
 
 SEED = SEEDS["networks"].first  # of the first network; the others follow
@@ -67,9 +66,8 @@ def work(options: Options) -> str:
 
 
 def save_network(path: Path, network: Any) -> None:
-    """Save a network, completely or not at all."""
-    with replacing(path) as partial_path:
-        network.save(partial_path)
+    """Save a network in a file."""
+    network.save(path)
 
 
 def show_validation(networks: Mapping[int, Any]) -> None:
