@@ -77,7 +77,7 @@ REFUSED = {
         ([LOG, "--operating-flow", "1e9"], "operating_flow must be near the flows of the log"),
     ],
     "speed": [
-        (["--device", "toaster"], "--device: device must be one that PyTorch can use"),
+        (["--device", "toaster"], "--device: device must be a device that PyTorch can use"),
     ],
     "sweep": [
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),

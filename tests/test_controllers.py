@@ -236,3 +236,10 @@ class TestSavedPolicies:
     def test_what_is_refused(self, location, complaint, zips):
         with pytest.raises(ValueError, match=complaint):
             members_of(location.format(zips))[0].run({}, 2, 2, 0)
+
+
+def test_a_comparison_of_cases_runs_one_of_the_networks_that_are_alike():
+    for name, count in (("neural-smith", 1), ("neural-self-tuning", 1), ("ppo", 5), ("pi", 1)):
+        members = ROSTER[name].with_few_networks().members()
+        assert len(members) == count
+        assert members[0].provenance == ROSTER[name].members()[0].provenance

@@ -76,7 +76,7 @@ def test_pages_name_seeds_of_the_table():
     ]
     named = re.findall(r"\d{1,3}(?:,\d{3}){2,}", " ".join(sentences))
     blocks = {block_of(int(seed.replace(",", ""))) for seed in named}
-    assert blocks == {"published", "validation"}
+    assert blocks == {"published", "validation", "trials"}
 
 
 def test_published_files_have_the_seeds_of_the_table():

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import applied_flow, float32_action
+from agents.hedge import RandomSetpoint
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
@@ -21,73 +22,7 @@ HORIZON = 5  # flows in a plan; the first is applied, then all are planned again
 SWEEPS = 100  # the largest number of sweeps of coordinate descent
 TOLERANCE = 1e-4  # t/h; coordinate descent stops if a sweep changes no flow by this much
 TINY = 1e-9  # added to variances, degC^2, and to divisors, so that none of them is 0
-BISECTIONS = 20  # They find a hedged set point to a millionth of the range of levels.
 WARM_UP = 200  # samples until the covariance of the filter hardly changes
-
-
-def probability_held(
-    age: NDArray[np.intp], ahead: NDArray[np.intp], shortest: int, longest: int
-) -> Array:
-    """Return the probability that a random level of the set point still holds later.
-
-    Parameters
-    ----------
-    age
-        Samples since the level began. The arguments broadcast together.
-    ahead
-        Samples from the present to the time of which the probability is asked.
-    shortest, longest
-        A level holds for a number of samples that is uniform from `shortest` to `longest`.
-    """
-    until_then = np.clip((longest - age - ahead) / (longest - shortest + 1), 0.0, 1.0)
-    until_now = np.clip((longest - age) / (longest - shortest + 1), TINY, 1.0)
-    return np.asarray(until_then / until_now)
-
-
-def hedged_setpoints(setpoint: Array, held: Array, amplitude: float, deviation: Array) -> Array:
-    """Return the outputs to aim at if the set point may change during the delay, degC.
-
-    A flow shows only after the delay. After the delay, the set point y_d is still `setpoint`,
-    degC, with the probability `held`. Otherwise y_d is a new level, uniform between the limits
-    -`amplitude` and `amplitude`, degC. Let the output be r + n, where n is normal with the
-    standard deviation `deviation`, degC. The r that minimises E|y_d - r - n| is the median of
-    y_d - n:
-
-        held Phi((r - setpoint) / deviation) + (1 - held) G(r) = 1/2.
-
-    G(r) is the mean of Phi((r - x) / deviation) over all levels x. With the integral of Phi,
-    I(z) = z Phi(z) + phi(z), it is
-
-        G(r) = deviation (I((r + amplitude) / deviation) - I((r - amplitude) / deviation))
-               / (2 amplitude).
-
-    The left side of the equation rises with r, so bisection finds r. The arguments broadcast
-    together.
-    """
-    from scipy.special import ndtr  # imported here, as SciPy is slow to import
-
-    deviation = np.maximum(deviation, TINY)  # Without noise, Phi is a step.
-    shape = np.broadcast_shapes(*map(np.shape, (setpoint, held, deviation)))
-    low = np.full(shape, -amplitude)
-    high = np.full(shape, amplitude)
-    for _ in range(BISECTIONS):
-        r = (low + high) / 2.0
-        below_level = ndtr((r - setpoint) / deviation)
-        upper = _integral_of_phi((r + amplitude) / deviation)
-        lower = _integral_of_phi((r - amplitude) / deviation)
-        below_next = deviation * (upper - lower) / (2.0 * amplitude)
-        too_low = held * below_level + (1.0 - held) * below_next < 0.5
-        low = np.where(too_low, r, low)
-        high = np.where(too_low, high, r)
-    return np.asarray((low + high) / 2.0)
-
-
-def _integral_of_phi(z: Array) -> Array:
-    """Return the integral of the standard normal distribution function up to z."""
-    from scipy.special import ndtr  # imported here, as SciPy is slow to import
-
-    density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
-    return np.asarray(z * ndtr(z) + density)
 
 
 @dataclass(frozen=True)
@@ -150,7 +85,7 @@ class PredictiveController:
     the flow of a command on the edge of the dead zone, whichever gives the better plan.
 
     The output to aim at is the set point, as if it never changed. If set points are random, the
-    age of a level tells how likely a change is before a flow shows; see `hedged_setpoints`.
+    age of a level tells how likely a change is before a flow shows; see `agents.hedge`.
 
     Parameters
     ----------
@@ -187,8 +122,10 @@ class PredictiveController:
         self._shows = (self._delay[:, np.newaxis, np.newaxis] + lag - ahead).clip(0)
         self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON, dtype=np.intp)
         self._models: dict[int, _Model] = {}  # by the sample from which the coefficients hold
-        self._levels = Levels(parameters)
-        if self._levels.random:
+        self._random: RandomSetpoint | None = None
+        levels = Levels(parameters)
+        if levels.random:
+            self._random = RandomSetpoint(levels.shortest, levels.longest, levels.amplitude)
             self._deviation = self._forecast_deviation()
         self.reset()
 
@@ -244,21 +181,15 @@ class PredictiveController:
 
         `setpoint` has the shape (runs,), and the result has the shape (runs, HORIZON).
         """
-        if not self._levels.random:
+        if self._random is None:
             return np.broadcast_to(setpoint[:, np.newaxis], (len(setpoint), HORIZON))
         self._age = np.where(setpoint == self._setpoint, self._age + 1, 0)
         self._setpoint = setpoint
-        held = probability_held(
-            self._age[:, np.newaxis],
-            self._reached + 1,
-            self._levels.shortest,
-            self._levels.longest,
-        )
-        return hedged_setpoints(
-            setpoint[:, np.newaxis],
-            held,
-            self._levels.amplitude,
-            self._deviation[:, np.newaxis],
+        ages = self._age[:, np.newaxis].astype(np.float64)
+        held = self._random.probability_held(ages, self._reached + 1.0)
+        deviation = np.maximum(self._deviation, TINY)[:, np.newaxis]
+        return np.asarray(
+            self._random.targets(setpoint[:, np.newaxis], held, deviation), np.float64
         )
 
     def _forecast_deviation(self) -> Array:

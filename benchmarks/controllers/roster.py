@@ -252,6 +252,7 @@ _SPECS = (
         knows=_DATA_SHEET,
         searched=f"{_LAW}; one step test",
         networks=_NETWORK,
+        networks_are_alike=True,
         pictured=True,
     ),
     ControllerSpec(
@@ -263,6 +264,7 @@ _SPECS = (
         knows=f"{_DATA_SHEET}; delay range",
         searched=f"{_LAW}; one step test",
         networks=_NETWORK,
+        networks_are_alike=True,
     ),
 )
 

@@ -117,6 +117,8 @@ class ControllerSpec:
     networks : callable, optional
         Returns the networks that were trained for the controller, by file. There is a member of
         the controller for each of them.
+    networks_are_alike : bool
+        Whether the networks hardly differ, so that most comparisons run the first one alone.
     random : bool
         Whether the controller draws random numbers, such as its initial weights.
     learns : bool
@@ -148,6 +150,7 @@ class ControllerSpec:
     made_for: Mapping[str, Any] = field(default_factory=dict)
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
     networks: Callable[[], Mapping[str, Any]] | None = None
+    networks_are_alike: bool = False
     random: bool = False
     learns: bool = False
     spans: Callable[[Parameters], plant_scale.Spans] | None = None
@@ -174,6 +177,13 @@ class ControllerSpec:
             )
             members.append(member)
         return members
+
+    def with_few_networks(self) -> "ControllerSpec":
+        """Return the record with the first network alone, if the networks are alike."""
+        networks = self.networks
+        if networks is None or not self.networks_are_alike:
+            return self
+        return replace(self, networks=lambda: dict(sorted(networks().items())[:1]))
 
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
         """Return the record of the controller with these arguments of `build`."""

@@ -38,7 +38,7 @@ SEEDS = {
         "episodes to choose policies by, with bounds in the package",
     ),
     "trials": Block(
-        6_200_000, 300_000, "episodes to try settings of the self-tuning controllers on"
+        6_200_000, 301_000, "episodes to try settings of the self-tuning controllers on"
     ),
     "published": Block(evaluation.SEED, 100_000, "episodes of published results"),
     "data sets": Block(9_000_000, 100_000, "episodes that data sets hold"),
