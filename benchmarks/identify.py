@@ -20,7 +20,7 @@ from mptc_gym import Parameters
 if TYPE_CHECKING:
     import pandas as pd
 
-    from benchmarks.loop.identification import Fit, Interval, Log
+    from benchmarks.loop.identification import Fit, Log
 
 FEWEST_ROWS = 100
 MOST_ROWS = 10_000  # of a longer log, the last rows are used
@@ -29,12 +29,6 @@ MOST_MISSING = 0.2  # share of the values of a column
 # One to three digits, and then groups of three digits: 1,480 may be 1.48 or 1480.
 THOUSANDS = r"[+-]?[1-9]\d{0,2}([.,]\d{3})+"
 CAPTION = "The log as it was recorded, and as the model simulates it from the flow"
-UNITS = {
-    "delay": "samples",
-    "dead_zone": "unit of the flow",
-    "gain": "unit of the temperature per unit of the flow",
-    "time_constant": "s",
-}
 
 
 @options
@@ -70,11 +64,17 @@ class Options:
 def work(options: Options) -> str:
     """Identify the plant of a log, and write the plant and a report."""
     from benchmarks.lib.report import Section, write_report  # here: slow to import, as below
-    from benchmarks.loop.identification import estimates, explained_share, identify
+    from benchmarks.loop.identification import (
+        estimates,
+        explained_share,
+        identify,
+        possible_zones,
+    )
 
     provenance = origin()
     log = read_log(options)
-    fit = identify(log, options.operating_flow, applied=options.applied)
+    zones = possible_zones(log.flow, options.operating_flow, applied=options.applied)
+    fit = identify(log, zones)
     intervals = estimates(fit)
     explained = explained_share(fit)
     arguments = plant_arguments(fit, options)
@@ -234,7 +234,7 @@ def row_numbers(seconds: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]
     return np.round(samples).astype(np.int64), interval
 
 
-def doubts(fit: Fit, intervals: dict[str, Interval], explained: float) -> list[str]:
+def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
     """Return why a fit may be wrong, in a sentence for each reason.
 
     `explained` is the share of the variance in the last third of the log that the fit explains.
@@ -256,7 +256,7 @@ def doubts(fit: Fit, intervals: dict[str, Interval], explained: float) -> list[s
         )
     if len(fit.zones) == 2:
         sentences.append("The flow had fewer than three values: no dead zone can be found.")
-    if intervals["gain"].low <= 0.0 <= intervals["gain"].high:
+    if intervals.low["gain"] <= 0.0 <= intervals.high["gain"]:
         sentences.append("The interval of the gain holds 0: the sign of the gain is unknown.")
     moves = np.diff(log.temperature)
     span = np.ptp(log.temperature)
@@ -308,24 +308,25 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
 
 
 def argument_ranges(
-    intervals: dict[str, Interval], arguments: dict[str, Any]
+    intervals: pd.DataFrame, arguments: dict[str, Any]
 ) -> dict[str, list[float]]:
     """Return the 95 % intervals as ranges of the environment's arguments."""
-    delay, zone = intervals["delay"], intervals["dead_zone"]
-    gain, time_constant = intervals["gain"], intervals["time_constant"]
+    limits = intervals[["low", "high"]].T
     largest_flow = max(-arguments["u_min"], arguments["u_max"])
-    gain_factors = np.sort([gain.low / gain.value, gain.high / gain.value])
+    gain_factors = limits.gain / intervals.value["gain"]
     # The factor multiplies the environment's time constant, which is 1 / rate samples for the
     # rate of 1 - pole. The factor must be above this rate.
-    rates = 1.0 - np.exp(-arguments["sampling_interval"] / np.array(time_constant))
-    slow_factors = np.clip(rates[0] / rates[1:], 1.000001 * rates[0], 10.0)
+    rates = 1.0 - np.exp(-arguments["sampling_interval"] / intervals.loc["time_constant"])
+    slow_factors = np.clip(
+        rates["value"] / rates[["low", "high"]], 1.000001 * rates["value"], 10.0
+    )
     ranges = {
-        "delay": [round(delay.low), round(delay.high)],
-        "dead_zone": [zone.low, min(zone.high, 0.99 * largest_flow)],
-        "gain_factor": gain_factors.clip(0.1, 10.0).tolist(),
+        "delay": [round(delay) for delay in limits.delay],
+        "dead_zone": limits.dead_zone.clip(upper=0.99 * largest_flow).tolist(),
+        "gain_factor": sorted(gain_factors.clip(0.1, 10.0)),
         "time_constant_factor": slow_factors.tolist(),
     }
-    return {name: limits for name, limits in ranges.items() if limits[0] < limits[1]}
+    return {name: pair for name, pair in ranges.items() if pair[0] < pair[1]}
 
 
 def findings(
@@ -338,6 +339,9 @@ def findings(
         "temperature in the last third of the log, when it is fitted to the first two thirds "
         "and simulates the last third from the flow and the measured disturbances.",
         f"The log has {len(log.flow):,} samples of {log.sampling_interval:g} s.",
+        "The delay is in samples, the time constant in seconds, the dead zone (half of its "
+        "width) in the unit of the flow, and the gain in the unit of the temperature per unit "
+        "of the flow.",
         f"The operating point is a flow of {centre:.4g}, at which the temperature is "
         f"{fit.operating_temperature:.4g}. The flow can be between "
         f"{centre + arguments['u_min']:.4g} and {centre + arguments['u_max']:.4g}. The numbers "
@@ -357,15 +361,15 @@ def findings(
     return text
 
 
-def table_of(intervals: dict[str, Interval]) -> pd.DataFrame:
-    """Return estimates and intervals as a table of text, with the units of the log."""
+def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
+    """Return a table of estimates and intervals as a table of text."""
     import pandas as pd
 
     rows = []
-    for name, (value, low, high) in intervals.items():
-        limits = f"[{low:.4g}, {high:.4g}]"
-        rows.append((name.replace("_", " "), f"{value:.4g}", limits, UNITS[name]))
-    return pd.DataFrame(rows, columns=["", "value", "95 % interval", "unit"])
+    for name, (value, low, high) in intervals.iterrows():
+        label = str(name).replace("_", " ")
+        rows.append((label, f"{value:.4g}", f"[{low:.4g}, {high:.4g}]"))
+    return pd.DataFrame(rows, columns=["", "value", "95 % interval"])
 
 
 def draw(fit: Fit, title: str, path: Path) -> None:

@@ -59,14 +59,6 @@ class DeadZone(NamedTuple):
         return np.where(is_inside, self.centre, flow)
 
 
-class Interval(NamedTuple):
-    """An estimate with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-
 def respond(flows: Array, delay: float, slow: float, fast: float = 0.0) -> Array:
     """Return the response of a delay and one or two lags in series, with gain 1.
 
@@ -174,8 +166,8 @@ class Fit:
 
     @cached_property
     def flow_response(self) -> Array:
-        """The response to the flow with gain 1, t/h, (rows,)."""
-        return self.unknowns.respond(self.zone.passed(self.log.flow))
+        """The response to the flow, degC, (rows,)."""
+        return self.unknowns.gain * self.unknowns.respond(self.zone.passed(self.log.flow))
 
     @cached_property
     def background(self) -> Array:
@@ -199,15 +191,14 @@ class Fit:
     def coefficients(self) -> Array:
         """The coefficients of the background by linear least squares, (terms,)."""
         terms = self.whiten(self.background)
-        target = self.whiten(self.log.temperature - self.unknowns.gain * self.flow_response)
+        target = self.whiten(self.log.temperature - self.flow_response)
         sizes = np.linalg.norm(terms, axis=0) + TINY
         return np.asarray(lstsq(terms / sizes, target, cond=1e-8)[0] / sizes)
 
     @cached_property
     def simulated(self) -> Array:
         """The temperatures of the model without noise, degC, (rows,)."""
-        response = self.unknowns.gain * self.flow_response
-        return np.asarray(self.background @ self.coefficients + response)
+        return np.asarray(self.background @ self.coefficients + self.flow_response)
 
     @cached_property
     def errors(self) -> Array:
@@ -236,6 +227,32 @@ class Fit:
         """
         return np.asarray(len(self.errors) * np.log(self.squares / (squares + TINY)))
 
+    def with_candidates(self, target: Array, candidates: Array) -> tuple[Array, Array]:
+        """Fit the background and one candidate term to a target, for each of the candidates.
+
+        Parameters
+        ----------
+        target : array of shape (rows,)
+            What is fitted, degC.
+        candidates : array of shape (rows, candidates)
+            Candidate terms.
+
+        Returns
+        -------
+        squares, coefficients : arrays of shape (candidates,)
+            Sums of the squared prediction errors (degC^2), and coefficients of the candidates.
+        """
+        base = self.whiten(self.background)
+        orthonormal = qr(base / (np.linalg.norm(base, axis=0) + TINY), mode="economic")[0]
+        whitened = self.whiten(np.column_stack([target, candidates]))
+        unexplained = whitened - orthonormal @ (orthonormal.T @ whitened)
+        errors, terms = unexplained[:, 0], unexplained[:, 1:]
+        powers = np.sum(terms**2, axis=0)
+        # A candidate that is a sum of terms of the background explains nothing more.
+        powers[powers <= 1e-10 * np.sum(whitened[:, 1:] ** 2, axis=0)] = np.inf
+        products = terms.T @ errors
+        return errors @ errors - products**2 / powers, products / powers
+
     def refined(self, evaluations: int = 25) -> "Fit":
         """Return the fit whose unknowns have the least squared errors nearby."""
         longest_delay = len(self.log.flow) / 6.0
@@ -253,43 +270,17 @@ class Fit:
             xtol=1e-5,
             max_nfev=evaluations,
         )
-        sizes = np.linalg.norm(result.jac, axis=0) + TINY
-        scaled = result.jac / sizes
-        covariance = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12) * np.mean(result.fun**2)
-        variances = np.diag(covariance).clip(0.0)
-        standard_errors = Unknowns(*(np.sqrt(variances) / sizes).tolist())
+        # The rows of the pseudo-inverse are as long as the roots of the inverse of J' J.
+        lengths = np.linalg.norm(np.linalg.pinv(result.jac), axis=1)
+        deviation = np.sqrt(np.mean(result.fun**2))
+        standard_errors = Unknowns(*(deviation * lengths).tolist())
         unknowns = Unknowns(*result.x.tolist())
         return replace(self, unknowns=unknowns, standard_errors=standard_errors)
 
 
-def add_term(base: Array, target: Array, candidates: Array) -> tuple[Array, Array]:
-    """Fit a base and one more term to a target by least squares, for candidates of that term.
-
-    Parameters
-    ----------
-    base : array of shape (blocks, terms)
-        Terms that are part of all fits.
-    target : array of shape (blocks,)
-        What the fits explain.
-    candidates : array of shape (blocks, candidates)
-        Terms of which a fit has one.
-
-    Returns
-    -------
-    squares, coefficients : arrays of shape (candidates,)
-        Sums of squared errors, and coefficients of the candidates.
-    """
-    orthonormal = qr(base / (np.linalg.norm(base, axis=0) + TINY), mode="economic")[0]
-    errors = target - orthonormal @ (orthonormal.T @ target)
-    independent = candidates - orthonormal @ (orthonormal.T @ candidates)
-    powers = np.sum(independent**2, axis=0)
-    # A candidate that is a sum of terms of the base explains nothing more.
-    powers[powers <= 1e-10 * np.sum(candidates**2, axis=0)] = np.inf
-    products = independent.T @ errors
-    return errors @ errors - products**2 / powers, products / powers
-
-
-def possible_zones(flow: Array, operating_flow: float | None, applied: bool) -> list[DeadZone]:
+def possible_zones(
+    flow: Array, operating_flow: float | None = None, *, applied: bool = False
+) -> list[DeadZone]:
     """Return the dead zones that a flow (rows,) may have passed, those without width first.
 
     All numbers are in t/h. The centre is the operating flow or, if that is None, in the range
@@ -311,20 +302,18 @@ def possible_zones(flow: Array, operating_flow: float | None, applied: bool) -> 
     return [DeadZone(centre, width) for width, centre in product(half_widths, centres)]
 
 
-def first_fit(log: Log, zones: list[DeadZone]) -> Fit:
+def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
     """Return a fit without a dead zone and with one lag, from a search over delays and lags."""
     rows = len(log.flow)
     changes = log.flow - log.flow[0]
-    no_zone = DeadZone(float(np.mean([zone.centre for zone in zones])))
     delays = np.unique(np.geomspace(1.0, rows / 6.0, 30).round()) - 1.0
     fits = []
     for slow in np.geomspace(max(1.0, rows / 2000.0), rows / 8.0, 6):
         # The noise often has the lag of the plant, which is where the search begins.
         start = Unknowns(0.0, 0.0, np.log(slow), first_of_d=-np.exp(-1.0 / slow))
-        fit = Fit(log, zones, start, no_zone)
+        fit = Fit(log, zones, start, zones[0], end_row=end_row)
         responses = [respond(changes, delay, slow) for delay in delays.tolist()]
-        base, target = fit.whiten(fit.background), fit.whiten(log.temperature)
-        squares, gains = add_term(base, target, fit.whiten(np.column_stack(responses)))
+        squares, gains = fit.with_candidates(log.temperature, np.column_stack(responses))
         best = int(np.argmin(squares))
         start = start._replace(gain=float(gains[best]), delay=float(delays[best]))
         fits.append(replace(fit, unknowns=start).refined(12))
@@ -340,9 +329,8 @@ def try_zones(fit: Fit) -> pd.DataFrame:
     half_width (t/h), gain (degC per t/h), and the improvement of the fit.
     """
     passed = np.column_stack([zone.passed(fit.log.flow) for zone in fit.zones])
-    responses = fit.whiten(fit.unknowns.respond(passed))
-    target = fit.whiten(fit.log.temperature)
-    squares, gains = add_term(fit.whiten(fit.background), target, responses)
+    responses = fit.unknowns.respond(passed)
+    squares, gains = fit.with_candidates(fit.log.temperature, responses)
     table = pd.DataFrame(fit.zones)
     return table.assign(gain=gains, improvement=fit.improvement(squares))
 
@@ -377,10 +365,10 @@ def with_load_steps(fit: Fit) -> Fit:
     spacing = max(int(slow / 4.0), len(rows) // 300, 1)
     step_rows = rows[spacing::spacing]
     steps = (rows[:, np.newaxis] >= step_rows).astype(np.float64)
-    candidates = fit.whiten(respond(steps, 0.0, slow))
+    responses = respond(steps, 0.0, slow)
     while len(fit.load_steps) < MOST_LOAD_STEPS:
-        base = fit.whiten(np.column_stack([fit.background, fit.flow_response]))
-        squares, _ = add_term(base, fit.whiten(fit.log.temperature), candidates)
+        without_flow = fit.log.temperature - fit.flow_response
+        squares, _ = fit.with_candidates(without_flow, responses)
         best = int(np.argmin(squares))
         if fit.improvement(squares[best]) < LOAD_STEP:
             break
@@ -388,67 +376,76 @@ def with_load_steps(fit: Fit) -> Fit:
     return fit
 
 
-def identify(log: Log, operating_flow: float | None = None, *, applied: bool = False) -> Fit:
+def identify(log: Log, zones: list[DeadZone], end_row: int | None = None) -> Fit:
     """Return the refined fit of a log.
 
     Parameters
     ----------
     log : Log
         The log, which may begin at any time.
-    operating_flow : float, optional
-        Flow at the centre of the dead zone, t/h. By default, the fit searches for it.
-    applied : bool
-        Whether the flow was measured behind the valve, so that there is no dead zone.
+    zones : list of DeadZone
+        The dead zones to choose from; see `possible_zones`.
+    end_row : int, optional
+        The fit leaves out the rows from this one on. By default, it leaves out none.
     """
-    fit = first_fit(log, possible_zones(log.flow, operating_flow, applied))
+    fit = first_fit(log, zones, end_row)
     for _ in range(2):  # because the best dead zone depends on the lags and vice versa
         fit = with_load_steps(with_lags(with_zone(fit)))
     return fit.refined()
 
 
-def estimates(fit: Fit) -> dict[str, Interval]:
-    """Return delay (samples), dead_zone (t/h), gain (degC per t/h) and time_constant (s).
+def estimates(fit: Fit) -> pd.DataFrame:
+    """Return the estimates of a refined fit with 95 % intervals, as a table of numbers.
 
-    The intervals of a refined fit hold two standard errors, and all dead zones that are nearly
-    as likely as the likeliest one.
+    The rows are delay (samples), dead_zone (t/h), gain (degC per t/h) and time_constant (s);
+    the columns are value, low and high.
     """
-    gain, delay, half_width = fit.unknowns.gain, fit.unknowns.delay, fit.zone.half_width
+    values = fit.unknowns
     margins = Unknowns(*(2.0 * SPREAD * np.array(fit.standard_errors)))
-    # A log may be written up to half a sample early or late.
-    delay_margin = margins.delay + 0.5
+    delay_margin = margins.delay + 0.5  # A log may be half a sample early or late.
+    # The dead zones that are nearly as likely as the likeliest one widen the interval of the
+    # gain, too.
     table = try_zones(fit)
     likely = table[table.improvement > table.improvement.max() - 4.0 * SPREAD**2]
-    lowest_gain = min(likely.gain.min(), gain)
-    highest_gain = max(likely.gain.max(), gain)
+    lower_gains = np.minimum(likely.gain - values.gain, 0.0)
+    higher_gains = np.maximum(likely.gain - values.gain, 0.0)
     step = table.half_width.max() / GRID
-    slow = fit.unknowns.slow * fit.log.sampling_interval
-    return {
-        "delay": Interval(delay, max(delay - delay_margin, 0.0), delay + delay_margin),
-        "dead_zone": Interval(
+    half_width = fit.zone.half_width
+    slow = values.slow * fit.log.sampling_interval
+    rows = {
+        "delay": (
+            values.delay,
+            max(values.delay - delay_margin, 0.0),
+            values.delay + delay_margin,
+        ),
+        "dead_zone": (
             half_width,
-            max(min(likely.half_width.min() - step, half_width), 0.0),
-            max(likely.half_width.max() + step, half_width),
+            max(min(half_width, likely.half_width.min() - step), 0.0),
+            max(half_width, likely.half_width.max() + step),
         ),
-        "gain": Interval(
-            gain,
-            gain - np.hypot(margins.gain, gain - lowest_gain),
-            gain + np.hypot(margins.gain, highest_gain - gain),
+        "gain": (
+            values.gain,
+            values.gain - np.hypot(margins.gain, lower_gains.min()),
+            values.gain + np.hypot(margins.gain, higher_gains.max()),
         ),
-        "time_constant": Interval(
-            slow, slow * np.exp(-margins.log_slow), slow * np.exp(margins.log_slow)
+        "time_constant": (
+            slow,
+            slow * np.exp(-margins.log_slow),
+            slow * np.exp(margins.log_slow),
         ),
     }
+    return pd.DataFrame(rows, index=["value", "low", "high"]).T
 
 
 def explained_share(fit: Fit) -> float:
     """Return how much of the last third of a log a fit to the first two thirds explains.
 
-    This is a share of the variance of the temperature. The model simulates the last third from
-    its flow and its disturbances. The share is negative if a constant explains more.
+    This is a share of the variance of the temperature. The second fit is made anew, and
+    simulates the last third from the flow and the disturbances. The share is negative if a
+    constant explains more.
     """
     end_row = 2 * len(fit.log.flow) // 3
-    earlier_steps = tuple(row for row in fit.load_steps if row < end_row)
-    earlier = replace(fit, end_row=end_row, load_steps=earlier_steps).refined()
+    earlier = identify(fit.log, fit.zones, end_row)
     temperature = fit.log.temperature[end_row:]
     return float(1.0 - np.var(temperature - earlier.simulated[end_row:]) / np.var(temperature))
 
