@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,6 +64,9 @@ class Options:
 
 def work(options: Options) -> str:
     """Identify the plant of a log, and write the plant and a report."""
+    # SciPy reads it when it is imported. Threads for small matrices only wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
     from benchmarks.lib.report import Section, write_report  # here: slow to import, as below
     from benchmarks.loop.identification import (
         estimates,
@@ -156,6 +160,7 @@ def read_table(path: Path) -> pd.DataFrame:
         raise UsageError(f"{path} cannot be read: {error.strerror}") from error
     except (pd.errors.EmptyDataError, pd.errors.ParserError) as error:
         raise UsageError(f"{path} is not a table: {str(error).strip()}") from error
+    table = table.apply(lambda column: column.str.strip())
     if not isinstance(table.index, pd.RangeIndex):
         raise UsageError(
             f"{path} has rows with more cells than the heading has names. Numbers with decimal "

@@ -124,7 +124,7 @@ WAYS = {
     "dates": re.sub(r"^(\d+),", dated, table(), flags=re.MULTILINE),
 }
 REFUSED = {
-    "line 4: flow looks like thousands: '1,480'": table('16,"1,480",1'),
+    "line 4: flow looks like thousands: '1,480'": table('16,"1,480" ,1'),
     "line 4: flow looks like thousands: '1.480'": table("16,1.480,1").replace(",", ";"),
     "line 4: a time step of 11.6 s: most time steps are 8": table("19.6,5,1"),
     "line 4: flow must be a number, got 'shut'": table("16,shut,1"),

@@ -33,7 +33,10 @@ SPREAD = 1.5
 GRID = 31  # values of the centre and of the half width of a dead zone that are tried
 DISTURBANCE_LAGS = 0.3, 0.9, 3.0  # multiples of the plant's larger time constant
 MOST_BLOCKS = 2000  # a fit to more means of rows takes longer and is not better
-SETTLING_BLOCKS = 10  # in which the noise filter forgets that it starts from zero
+# The noise filter starts from zero. Until it has settled, the prediction errors are as large as
+# the noise. They count little, but without them the state at the first row would be arbitrary.
+SETTLING_BLOCKS = 10
+SETTLING_WEIGHT = 0.1
 TINY = 1e-30  # prevents divisions by zero
 
 
@@ -152,7 +155,7 @@ class Fit:
     def whiten(self, terms: Array) -> Array:
         """Return D / C times the block means of terms, (rows, ...) to (blocks, ...).
 
-        The first blocks are left out, in which the filter settles.
+        The first blocks have a small weight, because the filter settles in them.
         """
         unknowns = self.unknowns
         c = stable_polynomial(unknowns.first_of_c, unknowns.second_of_c)
@@ -162,7 +165,9 @@ class Fit:
         blocks = len(used) // size
         shape = (blocks, size, *terms.shape[1:])
         means = used[: blocks * size].reshape(shape).mean(axis=1)
-        return np.asarray(lfilter(d, c, means, axis=0)[SETTLING_BLOCKS:])
+        whitened = np.asarray(lfilter(d, c, means, axis=0), np.float64)
+        whitened[:SETTLING_BLOCKS] *= SETTLING_WEIGHT
+        return whitened
 
     @cached_property
     def flow_response(self) -> Array:
