@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from benchmarks.loop.identification import Fit, Log
 
 FEWEST_ROWS = 100
-MOST_ROWS = 10_000  # of a longer log, the last rows are used
-LONGEST_GAP = 20  # samples
-MOST_MISSING = 0.2  # share of the values of a column
+MOST_ROWS = 10_000  # of a longer log, the last rows are used, to limit time and memory
+LONGEST_GAP = 20  # sampling intervals between two rows
+MOST_MISSING = 0.2  # share of the values of a column that may be missing
 # One to three digits, and then groups of three digits: 1,480 may be 1.48 or 1480.
 THOUSANDS = r"[+-]?[1-9]\d{0,2}([.,]\d{3})+"
 CAPTION = "The log as it was recorded, and as the model simulates it from the flow"
@@ -55,11 +55,11 @@ class Options:
     applied: bool = False
     """The flow was measured behind the valve: the fit has no dead zone."""
     operating_flow: Finite | None = None
-    """Flow at the operating point, the centre of the dead zone (default: found by the fit)."""
+    """Flow at the operating point, the centre of the dead zone (default: the fit finds it)."""
     u_min: Finite | None = None
-    """Smallest flow minus the operating flow (default: that of the log)."""
+    """Smallest flow minus the operating flow (default: the smallest flow of the log)."""
     u_max: Finite | None = None
-    """Largest flow minus the operating flow (default: that of the log)."""
+    """Largest flow minus the operating flow (default: the largest flow of the log)."""
 
 
 def work(options: Options) -> str:
@@ -104,7 +104,11 @@ def work(options: Options) -> str:
 
 
 def read_log(options: Options) -> Log:
-    """Read a log; a `UsageError` names the column and the line of what cannot be used."""
+    """Read the log of the options.
+
+    Missing temperatures are interpolated; missing flows and disturbances are those of the row
+    before. A `UsageError` names the column and the line that cannot be used.
+    """
     from benchmarks.loop.identification import Log
 
     table = read_table(options.log)
@@ -174,7 +178,11 @@ def read_table(path: Path) -> pd.DataFrame:
 
 
 def read_numbers(column: pd.Series[str]) -> pd.Series[float]:
-    """Return texts as numbers; a `UsageError` names the line of a text that is none."""
+    """Return a column of texts as numbers, with NaN for empty cells.
+
+    A `UsageError` names the line of a text that is not a number. If all texts with a decimal
+    mark look like thousands, a `UsageError` names the first of these texts.
+    """
     import pandas as pd
 
     marked = column[column.str.contains(f"[{column.attrs['marks']}]", na=False)]
@@ -207,7 +215,7 @@ def read_times(column: pd.Series[str]) -> NDArray[np.float64]:
 
 
 def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> None:
-    """Raise a `UsageError` that names the first line that is bad."""
+    """Raise a `UsageError` that names the first line of the file whose text is bad, if any."""
     if is_bad.any():
         line = int(np.argmax(is_bad)) + 2
         raise UsageError(
@@ -219,7 +227,8 @@ def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> Non
 def row_numbers(seconds: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
     """Return the number of samples since the first row, and the sampling interval (s).
 
-    A row may come a third of a sample early or late, and rows may be missing.
+    The times are in seconds, (rows,). A row may come 0.4 sampling intervals early or late, and
+    up to 19 rows in succession may be missing. Other times are a `UsageError`.
     """
     steps = np.diff(seconds)
     is_usual = np.abs(steps / np.median(steps) - 1.0) < 0.5
@@ -250,7 +259,7 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
         sentences.append(
             f"The model explains only {100 * max(explained, 0.0):.0f} % of the variance "
             "of the temperature in the last third of the log: the plant has changed, or "
-            "something else than the flow has moved the temperature."
+            "something other than the flow has moved the temperature."
         )
     correlations = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
     is_large = np.abs(correlations) > max(0.1, 2.5 / np.sqrt(len(errors)))
@@ -284,7 +293,7 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
     """Return the arguments of `MiddlePoint-v0` for the plant of a fit.
 
     The set point is smaller and slower than the environment's default if the plant cannot
-    follow that.
+    follow the default set point.
     """
     from benchmarks.loop.identification import polynomials
 
@@ -315,7 +324,11 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
 def argument_ranges(
     intervals: pd.DataFrame, arguments: dict[str, Any]
 ) -> dict[str, list[float]]:
-    """Return the 95 % intervals as ranges of the environment's arguments."""
+    """Return the 95 % intervals as ranges [low, high] of the environment's arguments.
+
+    `intervals` is the table of `estimates`. An argument whose interval is a single number is
+    left out.
+    """
     limits = intervals[["low", "high"]].T
     largest_flow = max(-arguments["u_min"], arguments["u_max"])
     gain_factors = limits.gain / intervals.value["gain"]
@@ -360,14 +373,14 @@ def findings(
         names = ", ".join(options.disturbance)
         text.append(f"The plant in plant.json does not respond to {names}.")
     text.append(
-        f"To compare controllers on the plant: python -m benchmarks.compare --plant "
-        f"{options.out / 'plant.json'}"
+        "The following command compares controllers on the plant: python -m "
+        f"benchmarks.compare --plant {options.out / 'plant.json'}"
     )
     return text
 
 
 def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of estimates and intervals as a table of text."""
+    """Return the table of `estimates` as a table of text, for the report."""
     import pandas as pd
 
     rows = []
