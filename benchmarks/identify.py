@@ -164,7 +164,8 @@ def read_table(path: Path) -> pd.DataFrame:
         raise UsageError(f"{path} cannot be read: {error.strerror}") from error
     except (pd.errors.EmptyDataError, pd.errors.ParserError) as error:
         raise UsageError(f"{path} is not a table: {str(error).strip()}") from error
-    table = table.apply(lambda column: column.str.strip())
+    for name in table:
+        table[name] = table[name].str.strip()
     if not isinstance(table.index, pd.RangeIndex):
         raise UsageError(
             f"{path} has rows with more cells than the heading has names. Numbers with decimal "
