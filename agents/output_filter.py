@@ -14,20 +14,22 @@ from agents.bank import CAUTION, FAST_POLE, GAINS, NOISE_COLOUR
 
 Array = NDArray[np.floating[Any]]
 
-# Standard deviations of the change of the load in a sample, as shares of the authority. There
-# is a filter for each.
-LOAD_CHANGES: Final = np.array([0.001, 0.007, 0.03])
+# The assumptions of each filter: the standard deviation of the change of the load in a sample,
+# as a share of the authority, and the share of noise in the bank's one-step variance. The last
+# filter is for plants with hardly any noise, where the bank's errors come from the load.
+LOAD_CHANGES: Final = np.array([0.001, 0.007, 0.03, 0.03])
+NOISE_SHARES: Final = np.array([1.0, 1.0, 1.0, 0.25])
 LOAD_MEMORY: Final = 0.998  # share of the load that is expected to remain after a sample
 GAIN_CHANGE: Final = 0.004  # standard deviation of the change of an uncertain gain in a sample
 REFERENCE_SPREAD: Final = 0.25  # first spread of a gain that changes by `GAIN_CHANGE`
 FILTER_MEMORY: Final = 0.998  # factor a sample of the filters' log-likelihoods
-READING_SHARE: Final = 0.1  # of the variance of one-step errors, due to noise of the readings
+READING_SHARE: Final = 0.1  # of the noise variance, due to the transmitter
 
 RESIDUAL, OLDER, LOAD, GAIN = range(4)  # the elements of the state
 
 
 class OutputFilter:
-    """Kalman filters of the outputs of n plants, one for each size of load changes.
+    """Kalman filters of the outputs of n plants, which differ in what they assume of the load.
 
     The output y(k) is g(k) s(k) + v(k). s is the response of the mean model, with gain 1, to
     past flows. The residual v is noise of (28) and the response to a load w:
@@ -37,8 +39,8 @@ class OutputFilter:
 
     a1 and a2 follow from the pole of the mean model, and c is the first coefficient of C. The
     gain g changes by a random walk. The state of a filter is v(k), a2 v(k-1) + c xi(k), w(k)
-    and g(k). The filters differ in the standard deviation of eta, `LOAD_CHANGES`. They are
-    weighted by the likelihood of their one-step errors, which they forget exponentially.
+    and g(k). The filters differ in the standard deviation of eta and in the variance of xi. The
+    filters are weighted by the likelihood of their one-step errors, with exponential forgetting.
 
     Parameters
     ----------
@@ -90,15 +92,16 @@ class OutputFilter:
         response, previous = responses
         self._follow(previous - self._response, poles)
         self._response = response
-        transition, noise = self._matrices(poles, variances)
+        noises = NOISE_SHARES[:, np.newaxis] * variances
+        transition, disturbances = self._matrices(poles, noises)
         states = np.einsum("nij,fnj->fni", transition, self._states)
-        covariances = transition @ self._covariances @ transition.transpose(0, 2, 1) + noise
+        covariances = transition @ self._covariances @ transition.transpose(0, 2, 1)
+        covariances = covariances + disturbances
         # The output is the residual and the gain times the response.
-        effects = covariances[:, :, :, RESIDUAL] + (
-            response[:, np.newaxis] * covariances[:, :, :, GAIN]
-        )
+        of_gain = response[:, np.newaxis] * covariances[:, :, :, GAIN]
+        effects = covariances[:, :, :, RESIDUAL] + of_gain
         error_variances = effects[:, :, RESIDUAL] + response * effects[:, :, GAIN]
-        error_variances = error_variances + READING_SHARE * variances
+        error_variances = error_variances + READING_SHARE * noises
         errors = output - states[:, :, RESIDUAL] - response * states[:, :, GAIN]
         corrections = effects / error_variances[:, :, np.newaxis]
         self._states = states + corrections * errors[:, :, np.newaxis]
@@ -129,8 +132,12 @@ class OutputFilter:
         self._states[:, :, OLDER] -= poles * FAST_POLE * residuals
         self._states[:, :, LOAD] += residuals
 
-    def _matrices(self, poles: Array, variances: Array) -> tuple[Array, Array]:
-        """Return state transitions, (n, 4, 4), and process noise, (filters, n, 4, 4)."""
+    def _matrices(self, poles: Array, noises: Array) -> tuple[Array, Array]:
+        """Return the state transitions and the covariances of the disturbances of a sample.
+
+        `noises` are the noise variances that the filters assume, shape (filters, n). The
+        transitions have the shape (n, 4, 4), and the covariances (filters, n, 4, 4).
+        """
         n = len(poles)
         a1 = poles + FAST_POLE
         a2 = -poles * FAST_POLE
@@ -145,12 +152,12 @@ class OutputFilter:
         from_eta = np.zeros((n, 4))
         from_eta[:, RESIDUAL] = 1.0 - a1 - a2
         from_eta[:, LOAD] = 1.0
-        of_noise = (1.0 - READING_SHARE) * variances[:, np.newaxis, np.newaxis]
-        of_load = np.square(LOAD_CHANGES)[:, np.newaxis, np.newaxis, np.newaxis]
-        noise = of_noise * np.outer(from_xi, from_xi)
-        noise[:, GAIN, GAIN] = self._gain_changes
-        load = of_load * (from_eta[:, :, np.newaxis] * from_eta[:, np.newaxis, :])
-        return transition, noise + load
+        of_xi = (1.0 - READING_SHARE) * noises[:, :, np.newaxis, np.newaxis]
+        of_eta = np.square(LOAD_CHANGES)[:, np.newaxis, np.newaxis, np.newaxis]
+        covariances = of_xi * np.outer(from_xi, from_xi)
+        covariances += of_eta * (from_eta[:, :, np.newaxis] * from_eta[:, np.newaxis, :])
+        covariances[:, :, GAIN, GAIN] += self._gain_changes
+        return transition, covariances
 
     def _weigh(self, errors: Array, variances: Array) -> None:
         """Renew the filters' probabilities by their one-step errors, shape (filters, n)."""

@@ -41,7 +41,7 @@ LEAST_NOISE = 0.05  # degC; below it the expected error is rounded at 0, where |
 class Training:
     """Everything that shapes the network, except versions and code."""
 
-    steps: int = 1200  # of the optimiser
+    steps: int = 1000  # of the optimiser
     plants: int = 128  # of a step
     segment: int = 100  # samples that a step runs and differentiates through
     hard_share: float = 0.6  # of the plants that are like those of `hard`
