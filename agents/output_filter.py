@@ -40,7 +40,7 @@ class OutputFilter:
     a1 and a2 follow from the pole of the mean model, and c is the first coefficient of C. The
     gain g changes by a random walk. The state of a filter is v(k), a2 v(k-1) + c xi(k), w(k)
     and g(k). The filters differ in the standard deviation of eta and in the variance of xi. The
-    filters are weighted by the likelihood of their one-step errors, with exponential forgetting.
+    filters are weighted by the likelihood of their one-step errors, and forget exponentially.
 
     Parameters
     ----------
