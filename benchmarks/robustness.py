@@ -29,10 +29,11 @@ PANELS = {  # of the picture: cases and titles
 SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3  # values of Ms
 TICKS = 200, 500, 1000, 2000, 5000  # of the valve travel in noise, t/h
 TEXT = (
-    "Each rule has one number, a time constant, with which its loop has an Ms of "
-    f"{ROBUSTNESS:g} on the paper's plant, away from the dead zone and the limits. The columns "
-    "of the cases are mean errors divided by the lowest achievable error. The range of stable "
-    "delays, in samples, is the range around the plant's 18 in which the loop is stable."
+    "Each tuning rule has one free time constant. In the table, the time constant is chosen such "
+    f"that the loop has a maximum sensitivity Ms of {ROBUSTNESS:g} on the paper's plant, without "
+    "its dead zone and limits. The columns of the cases are mean errors divided by the least "
+    "possible error. The range of stable delays, in samples, is the range around the plant's "
+    "delay of 18 samples in which the loop is stable."
 )
 CAPTION = "Error over valve travel along the robustness of three rules"
 
@@ -76,7 +77,7 @@ def work(options: Options) -> str:
 
 
 def lowest(scenario: Scenario) -> float:
-    """Return the lowest achievable mean error of a case, degC."""
+    """Return the least possible mean error of a case, degC."""
     from benchmarks.bounds.least import least_possible
 
     return least_possible(samples=scenario.samples, **scenario.arguments).value
@@ -144,7 +145,7 @@ def finding(rows: pd.DataFrame) -> str:
     return (
         f"At an Ms of {ROBUSTNESS:g}, {label(least['agent'])}'s valve travels {share:.0f} % as "
         f"far in noise as {label(most['agent'])}'s, with {least['ratio']:.3f} against "
-        f"{most['ratio']:.3f} times the lowest achievable error"
+        f"{most['ratio']:.3f} times the least possible error"
     )
 
 
@@ -169,7 +170,7 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
         noisy.set_xscale("log")
         noisy.set_xticks(TICKS, [f"{tick:,}" for tick in TICKS])
         noisy.xaxis.set_minor_locator(NullLocator())
-        noisy.set_ylabel("mean error / lowest achievable")
+        noisy.set_ylabel("mean error / least possible")
         handles, names = noisy.get_legend_handles_labels()
         large: Any = {"marker": "o", "markersize": 9, "markeredgecolor": "k", "linestyle": ""}
         handles.append(Line2D([], [], color="0.8", **large))

@@ -49,7 +49,7 @@ TEXT = (
     f"{OSCILLATES:g} °C larger than with an idle valve. The last two columns are shares of the "
     "runs."
 )
-PICTURE = "The error of each controller on each plant, relative to the lowest achievable error"
+PICTURE = "The error of each controller on each plant, relative to the least possible error"
 # Groups of the plants of a random design, by a condition on their arguments. The delays of
 # plants that drift make three groups of about equal size.
 GROUPS = {

@@ -41,7 +41,7 @@ class TestFindings:
         rows = [(agent, ratio) for agent, of in ratios.items() for ratio in of]
         plants = pd.DataFrame(rows, columns=["agent", "ratio"])
         assert sweep.map_finding(plants) == (
-            "Smith is within 5 % of the lowest achievable error on 75 % of the plants, "
+            "Smith is within 5 % of the least possible error on 75 % of the plants, "
             "PI (1992) on 33 %"
         )
         assert sweep.sorted_finding(plants) == (

@@ -25,7 +25,7 @@ LOWEST_SCORE = -0.5
 HIGHEST_SCORE = 0.999
 SCORE_TICKS = LOWEST_SCORE, 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, HIGHEST_SCORE
 SCORE_LABEL = (
-    "score: 0 = idle valve, 1 = lowest achievable error (axis logarithmic in 1 minus the score)"
+    "score: 0 = idle valve, 1 = least possible error (axis logarithmic in 1 minus the score)"
 )
 
 BAND: Any = {"alpha": 0.3, "linewidth": 0}  # the 10th to 90th percentile of the runs

@@ -47,7 +47,7 @@ SETPOINT: Any = {"color": "black", "linestyle": "--", "linewidth": 0.8}
 DEAD_ZONE: Any = {"color": "0.5", "alpha": 0.2, "linewidth": 0}
 LIMIT: Any = {"color": "0.4", "linestyle": ":", "linewidth": 1.0}
 
-RATIO_LABEL = "error / lowest achievable error\n(axis logarithmic in the ratio minus 1)"
+RATIO_LABEL = "error / least possible error\n(axis logarithmic in the ratio minus 1)"
 RATIO_FLOOR = 1.001  # Smaller ratios cannot be shown on a logarithmic axis: they stand here.
 RATIO_TICKS = 1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0, 4.0, 11.0, 31.0
 

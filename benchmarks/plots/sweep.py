@@ -28,11 +28,11 @@ from benchmarks.lib.pictures import (
 )
 from mptc_gym import Parameters
 
-NEAR = 1.05  # An error counts as near the lowest achievable one up to this multiple.
+NEAR = 1.05  # An error counts as near the least possible one up to this multiple.
 OFTEN = 0.5  # share of the runs on a plant from which on a mark of the map is drawn
 CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
 COLOUR_MAP = "viridis_r"
-NO_RATIO = "0.85"  # colour of a plant without a lowest achievable error
+NO_RATIO = "0.85"  # colour of a plant without a least possible error
 OSCILLATES: Any = {"color": "white", "marker": "o", "mec": "black", "ms": 3, "linestyle": ""}
 USELESS = "#E31A1C"  # colour of a plant on which control is no better than an idle valve
 NOMINAL: Any = {"color": "black", "marker": "+", "ms": 12, "mew": 1.8, "linestyle": ""}
@@ -103,7 +103,7 @@ def sorted_finding(plants: pd.DataFrame) -> str:
     """
     ratios = plants.groupby("agent")["ratio"].quantile(0.9).sort_values()
     if ratios.empty:
-        return "No plant has a lowest achievable error"
+        return "No plant has a least possible error"
     texts = [f"{ratio:.2f} for {label(str(agent))}" for agent, ratio in ratios.items()]
     finding = "On nine plants out of ten, the error ratio is at most "
     finding += ", ".join(texts[:-1][:2])
@@ -133,12 +133,12 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
             location="bottom",
             aspect=60,
         )
-        bar.set_label("error / lowest achievable error")
+        bar.set_label("error / least possible error")
         bar.set_ticks(CLASSES, labels=[f"{ratio:g}" for ratio in CLASSES])
 
 
 def map_finding(plants: pd.DataFrame) -> str:
-    """Return a sentence on the shares of plants with nearly the lowest achievable error.
+    """Return a sentence on the shares of plants with nearly the least possible error.
 
     It names the two controllers with the largest shares.
     """
@@ -151,7 +151,7 @@ def map_finding(plants: pd.DataFrame) -> str:
     names = [label(str(agent)) for agent in shares.index]
     percentages = [percent(share) for share in shares]
     finding = (
-        f"{names[0]} is within {percent(NEAR - 1.0)} of the lowest achievable error on "
+        f"{names[0]} is within {percent(NEAR - 1.0)} of the least possible error on "
         f"{percentages[0]} of the plants"
     )
     if len(names) > 1:
@@ -185,5 +185,5 @@ def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
     if (plants["useless"] >= OFTEN).any():
         entries["no better than an idle valve"] = Patch(color=USELESS)
     if plants["ratio"].isna().any():
-        entries["lowest achievable error unknown"] = Patch(color=NO_RATIO)
+        entries["least possible error unknown"] = Patch(color=NO_RATIO)
     return entries

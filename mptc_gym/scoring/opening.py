@@ -55,7 +55,10 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
     """
     target = form_of(policy).target
     if arguments and not isinstance(env, str | EnvSpec):
-        raise ValueError(f"{', '.join(arguments)} must be given where env is made")
+        raise ValueError(
+            f"{', '.join(arguments)} must be given where env is made: evaluate takes arguments "
+            "of the plant only with an id or a spec"
+        )
     with ExitStack() as stack:  # which undoes all in the reverse order
         if is_environment(env):
             copy = Copy(env)
