@@ -29,11 +29,11 @@ PANELS = {  # of the picture: cases and titles
 SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3  # values of Ms
 TICKS = 200, 500, 1000, 2000, 5000  # of the valve travel in noise, t/h
 TEXT = (
-    "Each tuning rule has one free time constant. In the table, the time constant is chosen such "
-    f"that the loop has a maximum sensitivity Ms of {ROBUSTNESS:g} on the paper's plant, without "
-    "its dead zone and limits. The columns of the cases are mean errors divided by the least "
-    "possible error. The range of stable delays, in samples, is the range around the plant's "
-    "delay of 18 samples in which the loop is stable."
+    "Each tuning rule has one free time constant. In the table, the time constant is chosen "
+    f"such that the loop has a maximum sensitivity Ms of {ROBUSTNESS:g} on the paper's plant, "
+    "without its dead zone and limits. The columns of the cases are mean errors divided by the "
+    "least possible error. The range of stable delays, in samples, is the range around the "
+    "plant's delay of 18 samples in which the loop is stable."
 )
 CAPTION = "Error over valve travel along the robustness of three rules"
 
