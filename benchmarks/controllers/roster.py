@@ -98,7 +98,7 @@ _NN = (
     "25 weights in the run itself; 6 gains by the search of version 0.1; a search of today "
     "takes 800 trials: 566 M samples, 6 min"
 )
-_LAW = "8,190 weights for all plants: 15.4 M samples a network, 5 min; 90 settings by hand"
+_LAW = "8,313 weights for all plants: 12.8 M samples a network, 5 min; 90 settings by hand"
 _RULE = f"nothing: one step test, a rule, slowed down to Ms {ROBUSTNESS:g}"
 _NETWORK = partial(trained, RecurrentNetwork, "neural-[0-9]*.npz")
 _SPECS = (
