@@ -105,7 +105,9 @@ def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
     wrappers = outer
     if _changes_policy(env):
         increments = vars(env).get("increments", "")  # the arguments of an IncrementalAction
-        wrappers = (*outer, f"{type(env).__name__}{increments}")
+        limit = vars(env).get("clip_obs")  # of a VecNormalize
+        name = f"{type(env).__name__}{increments}"
+        wrappers = (*outer, name if limit is None else f"{name}(clip_obs={limit:g})")
     if isinstance(env, MiddlePointEnv | MiddlePointVectorEnv):
         name = env.spec.id if env.spec else type(env).__name__
         return [PlantGroup(env.parameters, getattr(env, "num_envs", 1), name, wrappers)]

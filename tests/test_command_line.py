@@ -82,7 +82,7 @@ REFUSED = {
     "sweep": [
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
         (["--plants", "10"], "--plants and --design-seed are for --design random"),
-        (["--out", __file__], "cannot be written to: it is a file"),
+        (["--out", __file__], "cannot be written to: it is not a folder"),
     ],
     "tune": [
         (["pi", "--set", "b=[0.1,-0.1]"], "--plant: the gain must be finite and above 0 for a"),

@@ -538,22 +538,29 @@ REFUSED = {
         "wrappers of policy's training, IncrementalAction.*, got none"),
     "model whose VecNormalize is forgotten": (
         lambda: (model_of(PPO, normal(VecNormalize(dummy()))), NOISY),
-        "wrappers of policy's training, VecNormalize, got none"),
+        "wrappers of policy's training, VecNormalize.clip_obs=10., got none"),
     "the same, in a plain batch": (
         lambda: (model_of(PPO, normal(VecNormalize(dummy()))), make_vec_env(NOISY, N)),
-        "wrappers of policy's training, VecNormalize, got none"),
+        "wrappers of policy's training, VecNormalize.clip_obs=10., got none"),
     "what its VecNormalize wraps": (
         lambda: ((m := model_of(PPO, normal(VecNormalize(dummy())))), m.get_env().unwrapped),
-        "wrappers of policy's training, VecNormalize, got none"),
+        "wrappers of policy's training, VecNormalize.clip_obs=10., got none"),
     "one of the plants of its VecNormalize": (
         lambda: ((m := model_of(PPO, normal(VecNormalize(dummy())))), m.get_env().envs[0]),
-        "wrappers of policy's training, VecNormalize, got none"),
+        "wrappers of policy's training, VecNormalize.clip_obs=10., got none"),
     "model whose TransformObservation is forgotten": (
         lambda: (model_of(PPO, dummy(scaled)), make_vec_env(NOISY, N, **SHORT)),
         "wrappers of policy's training, TransformObservation, got none"),
     "processes of its training": (
         lambda: ((m := model_of(PPO, processes())), m.get_env()),
         r"as these cannot be copied \(SubprocVecEnv runs in .*spec_of\(model, id"),
+    "the policy of a model, in processes of its training": (
+        lambda: ((m := model_of(PPO, processes())).policy, m.get_env()),
+        r"as these cannot be copied \(SubprocVecEnv runs in .*pass the model itself"),
+    "statistics of its VecNormalize with another limit": (
+        lambda: (model_of(PPO, normal(VecNormalize(dummy()))),
+                 normal(VecNormalize(dummy(), clip_obs=0.1))),
+        r"VecNormalize.clip_obs=10., got VecNormalize.clip_obs=0.1."),
     "window of its training": (
         lambda: ((m := model_of(PPO, made(render_mode="human"))), m.get_env()),
         r"as these cannot be copied \(MiddlePointEnv shows a window"),

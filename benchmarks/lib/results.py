@@ -107,8 +107,8 @@ def _record(folder: Path) -> dict[str, Any]:
 
 def _refuse_other_files(place: Path) -> None:
     """Raise a `UsageError` if a folder of results holds files that its run did not write."""
-    if place.is_file():
-        raise UsageError(f"--out: {place} cannot be written to: it is a file")
+    if place.exists() and not place.is_dir():
+        raise UsageError(f"--out: {place} cannot be written to: it is not a folder")
     written = {RECORD, *_record(place).get("files", [])}
     foreign = [name for name in _files(place) if name not in written]
     if foreign:

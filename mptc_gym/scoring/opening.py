@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
@@ -13,11 +13,13 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
 from mptc_gym.checks import reject
-from mptc_gym.layers import is_environment, layers, normaliser_flag, plant_groups
+from mptc_gym.layers import is_environment, layers, loaded, normaliser_flag, plant_groups
 from mptc_gym.making import Env, make_batch, make_one
 from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.policies import form_of
 from mptc_gym.scoring.rollout import in_columns
+
+_POLICY_OF_A_MODEL: Final = "stable_baselines3.common.policies.BaseModel"
 
 # A vector environment of Gymnasium. `VectorEnv` as its type does not allow a list of seeds.
 Plants = Any
@@ -62,7 +64,7 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
     with ExitStack() as stack:  # which undoes all in the reverse order
         if is_environment(env):
             copy = Copy(env)
-            _refuse_training_environments(copy, getattr(target, "env", None))
+            _refuse_training_environments(copy, target)
             plants = _as_vector(copy.env)
             acts_itself = bool(copy.shared)
         else:
@@ -151,15 +153,22 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
         return observations, rewards, ended, np.zeros_like(ended), {**columns}
 
 
-def _refuse_training_environments(copy: Copy, training: Any) -> None:
-    """Raise a ValueError if a copy shares a layer with the environments of a training."""
-    if not is_environment(training):
-        return
-    if any(id(layer) in copy.shared for layer in layers(training)):
+def _refuse_training_environments(copy: Copy, target: Any) -> None:
+    """Raise a ValueError if `target`, a policy, may train in layers that a copy shares.
+
+    The `policy` of a model of Stable-Baselines3 does not know the environments of the model, so
+    it may train in any.
+    """
+    training = getattr(target, "env", None)
+    trains_there = is_environment(training) and any(
+        id(layer) in copy.shared for layer in layers(training)
+    )
+    is_part_of_a_model = isinstance(target, loaded(_POLICY_OF_A_MODEL))
+    if trains_there or (copy.shared and is_part_of_a_model):
         raise ValueError(
             "env must not be the training environments of policy, as these cannot be copied "
-            f"({copy.reason}): make others like them, or use evaluate(model, spec_of(model, "
-            "id)), with spec_of from mptc_gym.sb3"
+            f"({copy.reason}): make others like them, and pass the model itself, or use "
+            "evaluate(model, spec_of(model, id)), with spec_of from mptc_gym.sb3"
         )
 
 
