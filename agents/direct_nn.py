@@ -107,7 +107,7 @@ class DirectNNController(Controller):
 
     n_inputs: Size = 6
     n_hidden: Size = 3
-    # `python -m benchmarks.tune nn` found the gain factors and both scales.
+    # The gain factors and scales are those of the search `benchmarks.tune nn` in version 0.1.
     eta: NotNegative = 5.3
     eta_1: NotNegative = 0.0303
     eta_theta: NotNegative = 0.0462

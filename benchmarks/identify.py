@@ -256,7 +256,13 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
     """
     log, errors = fit.log, fit.errors
     sentences = []
-    if explained < 0.5:
+    last_third = log.flow[-(len(log.flow) // 3) :]
+    if np.ptp(last_third) == 0.0:
+        sentences.append(
+            "The flow does not move in the last third of the log, so the model could not be "
+            "checked there."
+        )
+    elif explained < 0.5:
         sentences.append(
             f"The model explains only {100 * max(explained, 0.0):.0f} % of the variance "
             "of the temperature in the last third of the log: the plant has changed, or "
@@ -304,7 +310,11 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
     flow = fit.log.flow - fit.zone.centre
     u_min = float(flow.min()) if options.u_min is None else options.u_min
     u_max = float(flow.max()) if options.u_max is None else options.u_max
-    reach = abs(fit.unknowns.gain) * max(-u_min, u_max)  # of the temperature
+    # How far the flow can move the temperature to both sides, as the set point has both signs.
+    reach = abs(fit.unknowns.gain) * max(-u_min, u_max)
+    if not is_one_sided(u_min, u_max):
+        reach = abs(fit.unknowns.gain) * min(-u_min, u_max)
+    widest_reach = abs(fit.unknowns.gain) * max(-u_min, u_max)
     settling = delay + round(4.0 * (fit.unknowns.slow + fit.unknowns.fast))  # samples
     return {
         "a": a.tolist(),
@@ -318,8 +328,13 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
         "sampling_interval": fit.log.sampling_interval,
         "setpoint_amplitude": min(0.6 * reach, defaults.setpoint_amplitude),
         "setpoint_period": max(2 * settling, defaults.setpoint_period),
-        "temperature_span": max(1.5 * reach, defaults.temperature_span),
+        "temperature_span": max(1.5 * widest_reach, defaults.temperature_span),
     }
+
+
+def is_one_sided(u_min: float, u_max: float) -> bool:
+    """Return whether the flow can hardly move to one side of the operating flow."""
+    return min(-u_min, u_max) < 0.2 * max(-u_min, u_max)
 
 
 def argument_ranges(
@@ -369,7 +384,13 @@ def findings(
     if fit.load_steps:
         minutes = [log.sampling_interval * row / 60.0 for row in sorted(fit.load_steps)]
         times = ", ".join(f"{minute:.0f}" for minute in minutes)
-        text.append(f"An unmeasured load stepped {times} min after the first row.")
+        text.append(f"By the fit, an unmeasured load stepped {times} min after the first row.")
+    if is_one_sided(arguments["u_min"], arguments["u_max"]):
+        text.append(
+            "Warning: the flow in the log moves hardly to one side of the operating point. Set "
+            "the limits of the valve with --u-min and --u-max before you compare controllers; "
+            "otherwise, they cannot follow half of the set points."
+        )
     if options.disturbance:
         names = ", ".join(options.disturbance)
         text.append(f"The plant in plant.json does not respond to {names}.")
@@ -402,8 +423,9 @@ def draw(fit: Fit, title: str, path: Path) -> None:
         above.plot(minutes, log.temperature, color="0.5", lw=1, label="recorded")
         after = slice(fit.first_row, None)
         above.plot(minutes[after], fit.simulated[after], color=COLOURS[1], label="model")
-        for row in fit.load_steps:
-            above.axvline(minutes[row], color="0.5", ls=":", label="step of a load")
+        for number, row in enumerate(fit.load_steps):
+            label = "step of a load" if number == 0 else None
+            above.axvline(minutes[row], color="0.5", ls=":", label=label)
         above.set_ylabel("temperature")
         above.legend(loc="upper left", ncols=3)
         above.margins(y=0.2)  # room for the legend

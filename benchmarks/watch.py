@@ -78,7 +78,9 @@ def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed:
         picture.quantize(palette=palette, dither=Dither.NONE) for picture in pictures
     ]
     durations = [DURATION] * len(rest) + [LAST_DURATION]
-    first.save(path, save_all=True, append_images=rest, duration=durations, loop=0)
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    first.save(unfinished, "GIF", save_all=True, append_images=rest, duration=durations, loop=0)
+    unfinished.replace(path)
 
 
 def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterator[Image]":

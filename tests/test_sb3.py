@@ -295,8 +295,8 @@ class TestScoreCallback:
             model_of(make_vec_env()).learn(64, ScoreCallback(path=tmp_path / "none" / "best"))
         model = model_of(VecNormalize(make_vec_env()))
         for env, message in (
-            (model.get_env().venv, "wrappers of policy's training, VecNormalize.clip_obs=10., got none"),
-            (make_vec_env(), "wrappers of policy's training, VecNormalize.clip_obs=10., got none"),
+            (model.get_env().venv, "training, VecNormalize.clip_obs=10., got none"),
+            (make_vec_env(), "training, VecNormalize.clip_obs=10., got none"),
             ("MiddlePoint-v0", "wrappers of policy's training, VecNormalize"),
             (one, "wrappers of policy's training, VecNormalize"),
         ):

@@ -86,9 +86,21 @@ def anticipation(
     movement = movement_before_changes(scenario, trajectories)
     if movement is None or movement.low <= 0.0 or movement.value < MARKED:
         return None
+    if not _follows(trajectories):
+        return None
     seeds = np.arange(seed, seed + runs)
     are_equal = trajectories[0].output.shape[1] == 1
     return _run_surprised(scenario, members, movement, seeds, are_equal)
+
+
+def _follows(trajectories: Sequence[Trajectory]) -> bool:
+    """Return whether the mean error is smaller than that of an output that stays at 0.
+
+    A loop that is unstable moves at all times, and anticipates nothing.
+    """
+    errors = np.concatenate([np.abs(run.next_error).ravel() for run in trajectories])
+    setpoints = np.concatenate([np.abs(run.setpoint).ravel() for run in trajectories])
+    return bool(errors.mean() < setpoints.mean())
 
 
 def movement_before_changes(
