@@ -1,5 +1,7 @@
 """Who moves before a square wave changes is marked, and scored where changes surprise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -119,3 +121,12 @@ def test_a_comparison_ranks_by_the_surprise_and_shows_the_mark():
     rows = ratio_table(estimates, scales, ["smith", "early"]).set_index("controller")
     assert rows.loc["early", "square"].endswith("‡")
     assert not rows.loc["Smith", "square"].endswith("‡")
+
+
+def test_a_loop_that_runs_away_does_not_anticipate():
+    # Outputs that happen to move before the changes, with errors as of an unstable loop.
+    square = SCENARIOS["square"]
+    runs = early.run(square.arguments, square.samples, 1, SEED)
+    assert anticipation(square, [early], [runs], 1, SEED) is not None
+    unstable = replace(runs, next_error=10.0 * runs.next_error)
+    assert anticipation(square, [early], [unstable], 1, SEED) is None
