@@ -98,6 +98,7 @@ _NN = (
     "25 weights in the run itself; 6 gains by the search of version 0.1; a search of today "
     "takes 800 trials: 566 M samples, 6 min"
 )
+_HOLDS = "hold times of random set points"
 _LAW = "8,313 weights for all plants: 12.8 M samples a network, 5 min; 90 settings by hand"
 _RULE = f"nothing: one step test, a rule, slowed down to Ms {ROBUSTNESS:g}"
 _NETWORK = partial(trained, RecurrentNetwork, "neural-[0-9]*.npz")
@@ -204,7 +205,7 @@ _SPECS = (
         look=("#5FCF9F", "v"),
         build=partial(with_bank, SelfTuningController),
         prior_knowledge=BANK,
-        knows=f"{_DATA_SHEET}; delay range",
+        knows=f"{_DATA_SHEET}; delay range; {_HOLDS}",
         searched="30 settings by hand; one step test",
     ),
     ControllerSpec(
@@ -249,7 +250,7 @@ _SPECS = (
         look=("#0072B2", "^"),
         build=NeuralSmithPredictor,
         prior_knowledge=(*DATA_SHEET, *SETPOINT),
-        knows=_DATA_SHEET,
+        knows=f"{_DATA_SHEET}; {_HOLDS}",
         searched=f"{_LAW}; one step test",
         networks=_NETWORK,
         networks_are_alike=True,
@@ -261,7 +262,7 @@ _SPECS = (
         look=("#005A3C", "v"),
         build=partial(with_bank, NeuralSelfTuningController),
         prior_knowledge=BANK,
-        knows=f"{_DATA_SHEET}; delay range",
+        knows=f"{_DATA_SHEET}; delay range; {_HOLDS}",
         searched=f"{_LAW}; one step test",
         networks=_NETWORK,
         networks_are_alike=True,
