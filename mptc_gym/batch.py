@@ -1,7 +1,7 @@
 """Implement what the vector environments share: arguments, masks, time limits, resets, infos.
 
-`MiddlePointVectorEnv` adds plants in NumPy arrays, and `MiddlePointTorchEnv` adds plants in
-PyTorch tensors.
+A mask is an array of bool that selects plants. `MiddlePointVectorEnv` adds plants in NumPy
+arrays, and `MiddlePointTorchEnv` adds plants in PyTorch tensors.
 """
 
 from __future__ import annotations
@@ -24,24 +24,37 @@ from mptc_gym.plant import FACTORS
 from mptc_gym.plant_state import PlantState, plant_state
 from mptc_gym.signals import FOREVER
 
-Array = Any  # of NumPy or PyTorch, depending on the environment
+Array = Any  # a NumPy array or a PyTorch tensor, depending on the environment
 Infos = dict[str, Any]
-Mask = NDArray[np.bool_]  # of plants, shape (num_envs,)
+Mask = NDArray[np.bool_]  # True for the selected plants, shape (num_envs,)
 
 
 class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     """n plants that advance together: the part that does not depend on the array library.
 
-    A subclass sets these attributes:
+    The array library is NumPy or PyTorch.
+
+    Parameters
+    ----------
+    num_envs
+        Number n of plants.
+    max_episode_steps
+        Samples after which an episode is truncated; None or -1 for no limit.
+    autoreset_mode
+        An `AutoresetMode` or its value: when the plant of an ended episode is reset.
+    arguments
+        The arguments of the plants, by name.
 
     Attributes
     ----------
     _where : callable
-        `numpy.where` or `torch.where`.
+        `numpy.where` or `torch.where`. A subclass sets this attribute.
     _window
-        The observations; `_window.present()` returns a copy of the present ones.
+        The object that keeps the observations; `_window.present()` returns a copy of the
+        present observations, shape (num_envs, size). A subclass sets this attribute.
     _zeros : array
-        Zeros of the library, shape (num_envs,), only to be read.
+        Zeros in an array of the library, shape (num_envs,), that nobody modifies. A subclass
+        sets this attribute.
     """
 
     _where: Any
@@ -72,16 +85,17 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         self.single_observation_space = observation_space(self.parameters)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        # Keys of the infos of every step, and of their masks.
+        # Keys of the infos of every step, and below keys of the masks of these infos.
         self._names = [*INFO]
         if self.parameters.is_disturbed:
             self._names.append("disturbance")
         if self.parameters.drifts:
             self._names += FACTORS
         self._masks = [f"_{name}" for name in self._names]
-        # Steps of the environment. A plant's k is the clock minus the start of its episode.
+        # Steps of the environment so far. The sample k of a plant is the clock minus the start
+        # of the plant's episode.
         self._clock = 0
-        self._starts = np.zeros(num_envs, np.int64)
+        self._starts = np.zeros(num_envs, np.int64)  # the clock at k = 0 of each plant
         self._first_end = 0  # the clock when an episode ends next; 0 before the first reset
         self._ended: Mask | None = None  # plants whose episode has ended; None for no plant
 
@@ -93,8 +107,8 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         Parameters
         ----------
         seed
-            Restarts the random numbers; see the docstring of the class. Without a seed, the
-            random numbers continue.
+            Restarts the random number streams; see the docstring of the class. Without a seed,
+            the next episodes continue the present streams.
         options
             `reset_mask`, a bool array of shape (num_envs,), selects the plants to reset. The
             first reset must include all plants. `MiddlePointTorchEnv` also takes `signals`.
@@ -102,16 +116,16 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         Returns
         -------
         observations : array
-            The observations, shape (num_envs, size). Plants that are not reset keep their last
-            observation.
+            The observations, shape (num_envs, size). The row of a plant that is not reset is
+            the plant's last observation.
         infos : dict
-            The infos, in arrays of shape (num_envs,), and their masks, which are False for
-            plants that are not reset. Several masks may be the same array.
+            The infos, in arrays of shape (num_envs,), and the masks of the infos, which are
+            False for plants that are not reset. Several masks may be the same array.
 
         Raises
         ------
         ValueError
-            If an argument is invalid. The environment is then unchanged.
+            If an argument is invalid. The error leaves the environment unchanged.
         ResetNeeded
             If the first reset does not include all plants.
         """
@@ -130,25 +144,27 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         Parameters
         ----------
         actions
-            The actions a(k), shape (num_envs, 1).
+            The actions a(k), shape (num_envs, 1): -1 commands the flow `u_min`, 1 `u_max`.
 
         Returns
         -------
         observations : array
-            The observations at k+1, shape (num_envs, size).
+            The observations at sample k+1, shape (num_envs, size).
         rewards, terminations, truncations : array
-            The rewards of e(k+1) and the flags, shape (num_envs,). No episode terminates.
+            The rewards of the errors e(k+1), and the flags of ended episodes, shape
+            (num_envs,). No episode terminates; the time limit truncates episodes.
         infos : dict
-            The infos at k+1, in arrays of shape (num_envs,), and their masks. Several masks may
-            be the same array.
+            The infos at sample k+1, in arrays of shape (num_envs,), and the masks of the infos.
+            Several masks may be the same array.
 
         Raises
         ------
         ValueError
-            If the actions have another shape or are not finite. The environment is then
-            unchanged.
+            If the actions have another shape or are not finite. The error leaves the
+            environment unchanged.
         ResetNeeded
-            Before the first reset; with autoreset disabled, also if an episode has ended.
+            If `step` is called before the first `reset`; with the autoreset mode "Disabled",
+            also if an episode has ended and its plant was not reset.
         """
         if not self._first_end:
             raise ResetNeeded("call reset before step")
@@ -171,9 +187,11 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
     def _end_episodes(
         self, observations: Array, rewards: Array, terminations: Array, _: Array, infos: Infos
     ) -> tuple[Array, Array, Array, Array, Infos]:
-        """Return what a step returns where episodes end, or have ended at the previous step.
+        """Return what `step` returns when episodes end now, or have ended at the previous step.
 
-        The arguments are what the step would return if no episode ended.
+        The autoreset mode decides whether this method resets the plants of the ended episodes.
+        The arguments `observations`, `rewards`, `terminations` and `infos`, and the unused
+        truncations, are what `step` would return if no episode ended.
         """
         ended = self._clock - self._starts >= self._limit
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
@@ -185,7 +203,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             infos["_final_obs"] = flags
             self._restart(ended, infos)
             return self._window.present(), rewards, terminations, self._as_array(ended), infos
-        if self._ended is not None:  # at the previous step: this step resets these plants
+        if self._ended is not None:  # plants that ended at the previous step are reset now
             rewards = self._where(self._as_array(self._ended), 0, rewards)
             self._restart(self._ended, infos)
             observations = self._window.present()
@@ -194,9 +212,15 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         return observations, rewards, terminations, self._as_array(ended), infos
 
     def _restart(self, mask: Mask, infos: Infos) -> Infos:
-        """Begin an episode of some plants, and return infos that hold k = 0 for these plants.
+        """Begin an episode of some plants, and return infos with sample k = 0 of these plants.
 
-        `infos` are the infos of a step, which go on for the other plants, or an empty dict.
+        Parameters
+        ----------
+        mask
+            The plants.
+        infos
+            The infos of a step, which stay valid for the other plants, or an empty dict after a
+            reset. This dict is filled and returned.
         """
         self._starts[mask] = self._clock
         self._first_end = int(self._starts.min()) + self._limit
@@ -212,17 +236,22 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         return infos
 
     def plant_state(self) -> PlantState:
-        """Return what a teacher may know of each plant at the present sample.
+        """Return what a teacher in training may know of each plant at the present sample.
 
-        The state holds delay (samples), dead zone (t/h), gain (degC per t/h) and time constant
-        (s), as they have drifted, and the load (degC), each of shape (num_envs,). A policy
-        cannot see this state, but a critic or a teacher in training may. The present sample is
-        that of the observation which `step` or `reset` has just returned.
+        A policy cannot observe the state, but a critic or a teacher in training may use the
+        state. The present sample is that of the observation which `step` or `reset` has just
+        returned.
+
+        Returns
+        -------
+        PlantState
+            Delay (samples), dead zone (t/h), gain (degC per t/h), time constant (s) and load
+            (degC), each of shape (num_envs,). Gain and time constant include drift so far.
 
         Raises
         ------
         ResetNeeded
-            Before the first reset.
+            If `plant_state` is called before the first `reset`.
         """
         if not self._first_end:
             raise ResetNeeded("call reset before plant_state")
@@ -231,7 +260,10 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         return plant_state(self.parameters, numbers, ages, load)
 
     def _checked_mask(self, options: Mapping[str, Any]) -> Mask:
-        """Return the mask of the plants to reset: all, unless the options say otherwise."""
+        """Return the mask of the plants to reset: `options["reset_mask"]`, or else all plants.
+
+        A ValueError is raised if the mask is not an array of bool with at least one True.
+        """
         if "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
         mask = options["reset_mask"]
@@ -249,38 +281,60 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
 
     @abstractmethod
     def _as_array(self, values: NDArray[Any]) -> Array:
-        """Return a mask or integers, shape (num_envs,), in a new array of the library."""
+        """Return a mask or integers, shape (num_envs,), as a new array of the array library."""
 
     @abstractmethod
     def _hidden_state(self) -> tuple[dict[str, Array], Array]:
-        """Return what infos and observations of the present sample do not show.
+        """Return the plant numbers and the load, which no observation shows, for `plant_state`.
 
-        These are the plant numbers that are ranges, by name, and the load w, degC, in arrays of
-        shape (num_envs,).
+        Returns
+        -------
+        numbers : dict of array
+            The numbers that were drawn for arguments that are ranges, by name, shape
+            (num_envs,).
+        load : array
+            The load w at the present sample, degC, shape (num_envs,).
         """
 
     @abstractmethod
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Check seed and options of a `reset` of the plants in the mask, then apply both."""
+        """Check seed and options of a `reset`, restart random numbers, and store the options.
+
+        Parameters
+        ----------
+        mask
+            The plants to reset, shape (num_envs,).
+        seed, options
+            The arguments of `reset`; a ValueError is raised if one of them is invalid.
+        """
 
     @abstractmethod
     def _begin(self, mask: Mask) -> dict[str, Array]:
         """Begin an episode of the plants in the mask; return the infos at k = 0 that are not 0.
 
-        The arrays have the shape (num_envs,); only the elements of the mask are of use.
+        The arrays have the shape (num_envs,); elements of plants outside the mask have no
+        meaning.
         """
 
     @abstractmethod
     def _checked_actions(self, actions: Any) -> Array:
-        """Return the actions, shape (num_envs,); 0 for plants whose episode has ended.
+        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended.
 
-        Actions of another shape and actions that are not finite raise a ValueError.
+        Actions of a shape other than (num_envs, 1) and actions that are not finite raise a
+        ValueError.
         """
 
     @abstractmethod
     def _advance(self, a: Array) -> tuple[Array, Array, Array, Array, Infos]:
-        """Move all plants by one sample; return what `step` returns if no episode ends."""
+        """Move all plants by one sample, and return what `step` returns if no episode ends.
+
+        `a` are the checked actions, shape (num_envs,).
+        """
 
     @abstractmethod
     def _final(self, ended: Mask, observations: Array) -> Array:
-        """Return `final_obs`: the observations of plants whose episode has just ended."""
+        """Return `final_obs`, the last observations of the plants whose episode has just ended.
+
+        `ended` is True for these plants, shape (num_envs,), and `observations` are the
+        observations of all plants, shape (num_envs, size).
+        """

@@ -1,4 +1,4 @@
-"""Draw a record of an episode with pygame: temperatures above flows."""
+"""Draw a picture of an episode with pygame: a panel of temperatures above a panel of flows."""
 
 import math
 from collections.abc import Sequence
@@ -20,11 +20,12 @@ from mptc_gym.record import Record
 
 Colour = tuple[int, int, int]  # red, green and blue, 0 to 255
 
-SIZE = 960, 540  # of the picture: width and height, pixels
+SIZE = 960, 540  # width and height of the picture, pixels
 # The panels: left edge, upper edge, width and height, in pixels from the upper left corner.
 TEMPERATURES = pygame.Rect(72, 44, 864, 214)
 FLOWS = pygame.Rect(72, 324, 864, 182)
-# The lines have the colours of Okabe and Ito, safe for colour-blind readers.
+# Colours of lines, areas and texts. The coloured lines have colours of the palette of Okabe and
+# Ito, which colour-blind readers can tell apart.
 TEMPERATURE = (0, 114, 178)
 SETPOINT = (213, 94, 0)
 APPLIED = (0, 158, 115)
@@ -35,12 +36,12 @@ LIMIT = (130, 130, 130)
 _GRID = (236, 237, 240)
 _INK = (60, 64, 70)
 _PAPER = (255, 255, 255)
-clock = pygame.time.Clock()  # limits the frame rate
+clock = pygame.time.Clock()  # limits the frame rate of the window
 viewers: WeakSet[object] = WeakSet()  # environments that show pictures in the window
 
 
 class Label(NamedTuple):
-    """A text above a panel."""
+    """A text above a panel, as in the legend of a diagram."""
 
     text: str
     colour: Colour
@@ -48,11 +49,20 @@ class Label(NamedTuple):
 
 
 class Panel:
-    """A part of the picture, with axes.
+    """A part of the picture, with a frame, a vertical axis, and a horizontal axis of time.
 
-    `place` is where the panel lies in the picture. `axis` holds the lower and the upper end of
-    the vertical axis. The horizontal axis shows the samples of the record, with numbers in
-    minutes.
+    The horizontal axis shows the samples of the record, with numbers in minutes.
+
+    Parameters
+    ----------
+    surface
+        The picture to draw on.
+    record
+        The samples to draw.
+    place
+        The panel's rectangle in the picture, pixels.
+    axis
+        The lower and the upper end of the vertical axis, degC or t/h.
     """
 
     def __init__(
@@ -76,15 +86,17 @@ class Panel:
     def y(self, value: float) -> float:
         """Return the vertical position of a value, pixels from the picture's upper edge.
 
-        A value beyond the vertical axis is drawn at the edge of the panel.
+        `value` has the unit of the vertical axis, degC or t/h. A value beyond the vertical axis
+        gets a position at the edge of the panel.
         """
         low, high = self._axis
         below_top = (high - value) / (high - low) * self._place.height
-        # 3 pixels inside the frame. By this order of min and max, NaN is at the lower edge.
+        # At least 3 pixels, a line's width, inside the frame. By the order of min and max, NaN
+        # is drawn at the lower edge.
         return self._place.top + max(3.0, min(self._place.height - 3.0, below_top))
 
     def grid(self) -> None:
-        """Draw grid and frame, and write the numbers of both axes."""
+        """Draw the grid and the frame of the panel, and write the numbers of both axes."""
         place = self._place
         for value in ticks(*self._axis):
             self.level(_GRID, value)
@@ -96,13 +108,24 @@ class Panel:
             x = self.x(minutes * samples_per_minute)
             pygame.draw.line(self._surface, _GRID, (x, place.top), (x, place.bottom))
             self.write(f"{minutes:.6g}", _INK, midtop=(x, place.bottom + 6))
-        # The unit stands to the left of a number at the edge.
+        # The unit of the time axis stands to the left of the axis, clear of a number at the
+        # edge.
         self.write("min", _INK, topright=(place.left - 34, place.bottom + 6))
         frame_of_panel = place.left, place.top, place.width + 1, place.height + 1
         pygame.draw.rect(self._surface, LIMIT, frame_of_panel, 1)
 
     def shade(self, colour: Colour, first: int, last: int, low: float, high: float) -> None:
-        """Shade the area from sample `first` to `last` and from the value `low` to `high`."""
+        """Shade a rectangle of the panel.
+
+        Parameters
+        ----------
+        colour
+            Colour by which the colours of the picture are multiplied.
+        first, last
+            The samples at the left and the right edge of the rectangle.
+        low, high
+            The values at the lower and the upper edge, in the unit of the vertical axis.
+        """
         left = max(self._place.left, round(self.x(first)))
         right = round(self.x(last))
         top = round(self.y(high))
@@ -111,15 +134,25 @@ class Panel:
         self._surface.fill(colour, area, pygame.BLEND_RGB_MULT)
 
     def level(self, colour: Colour, value: float) -> None:
-        """Draw a horizontal line across the panel."""
+        """Draw a horizontal line of a colour at `value`, in the panel's unit, degC or t/h."""
         y = self.y(value)
         pygame.draw.line(self._surface, colour, (self._place.left, y), (self._place.right, y))
 
     def curve(self, colour: Colour, values: Sequence[float], width: int, *, held: bool) -> None:
-        """Draw the values of the latest samples, the newest last, as a line.
+        """Draw a curve through the values of the latest samples.
 
-        `width` is that of the line, in pixels. With `held`, the line is a staircase: a value
-        holds until the next sample.
+        Parameters
+        ----------
+        colour
+            Colour of the curve.
+        values
+            One value for each of the latest samples, the newest last, in the unit of the
+            vertical axis.
+        width
+            Width of the line, pixels.
+        held
+            Whether the curve is a staircase, in which each value holds until the next sample;
+            otherwise, straight lines join the values.
         """
         first = self._record.k + 1 - len(values)
         points: list[tuple[float, float]] = []
@@ -134,7 +167,7 @@ class Panel:
             pygame.draw.lines(self._surface, colour, False, points, width)
 
     def heading(self, *labels: Label) -> None:
-        """Write labels above the panel, from left to right."""
+        """Write labels in one line above the panel, from left to right."""
         x, y = self._place.left, self._place.top - 16
         for label in labels:
             box = self.write(f" {label.text} ", label.colour, label.ground, midleft=(x, y))
@@ -143,10 +176,17 @@ class Panel:
     def write(
         self, text: str, colour: Colour, ground: Colour = _PAPER, **anchor: tuple[float, float]
     ) -> pygame.Rect:
-        """Write a text, and return the rectangle that it fills.
+        """Write a text into the picture, and return the rectangle that the text fills, pixels.
 
-        `anchor` is one position of the rectangle by its name in pygame, as in
-        `midleft=(x, y)`, in pixels.
+        Parameters
+        ----------
+        text
+            The text, whose hyphens are written as minus signs.
+        colour, ground
+            Colour of the text, and colour behind the text.
+        **anchor
+            The position of one point of the rectangle, by pygame's name of the point, as in
+            `midleft=(x, y)`, pixels from the picture's upper left corner.
         """
         image = self._font.render(text.replace("-", "\N{MINUS SIGN}"), True, colour, ground)
         ((name, (x, y)),) = anchor.items()
@@ -154,7 +194,7 @@ class Panel:
 
 
 def draw(record: Record) -> pygame.Surface:
-    """Return a picture of a record, 960 by 540 pixels."""
+    """Return a picture of a record, 960 pixels wide and 540 pixels high."""
     pygame.font.init()
     # Three bytes per pixel, in the order of an array, so that making an array is just a copy.
     surface = pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
@@ -165,7 +205,7 @@ def draw(record: Record) -> pygame.Surface:
 
 
 def _draw_temperatures(surface: pygame.Surface, record: Record) -> None:
-    """Draw the upper panel: temperature and set point."""
+    """Draw the upper panel of a record on a surface: temperature and set point, degC."""
     panel = Panel(surface, record, TEMPERATURES, record.temperature_axis)
     panel.grid()
     panel.curve(TEMPERATURE, [sample.output for sample in record.samples], 3, held=False)
@@ -183,7 +223,11 @@ def _draw_temperatures(surface: pygame.Surface, record: Record) -> None:
 
 
 def _draw_flows(surface: pygame.Surface, record: Record) -> None:
-    """Draw the lower panel: flows, limits, dead zone, and the time in transit."""
+    """Draw the lower panel of a record on a surface: flows, limits, dead zone, transit time.
+
+    The transit time is shaded: a flow that was applied in this time has not yet reached the
+    middle point.
+    """
     plant = record.plant
     panel = Panel(surface, record, FLOWS, record.flow_axis)
     panel.grid()
@@ -194,8 +238,8 @@ def _draw_flows(surface: pygame.Surface, record: Record) -> None:
     panel.shade(IN_TRANSIT, record.k - int(plant.delay), record.k, lowest, highest)
     for limit in (plant.u_min, plant.u_max):
         panel.level(LIMIT, limit)
-    # A sample holds the flows of the step that led to it, so these flows begin one sample
-    # earlier. The flows of the oldest sample would begin before the picture.
+    # A sample k holds the flows of the step from sample k-1 to k, so these flows begin at
+    # sample k-1 in the picture. The flows of the oldest sample would begin before the picture.
     applied = [sample.applied for sample in record.samples]
     commands = [sample.command for sample in record.samples]
     panel.curve(APPLIED, [*applied[1:], applied[-1]], 3, held=True)
@@ -209,14 +253,23 @@ def _draw_flows(surface: pygame.Surface, record: Record) -> None:
 
 
 def frame(record: Record) -> NDArray[np.uint8]:
-    """Return a picture of a record as an array, shape (540, 960, 3): height, width, colours."""
+    """Return a picture of a record, uint8, shape (540, 960, 3): rows, columns, RGB."""
     return np.array(pygame.surfarray.pixels3d(draw(record)).swapaxes(0, 1), order="C")
 
 
 def show(record: Record, fps: float, viewer: object) -> None:
-    """Show a picture in the window, opened if necessary, at most `fps` times a second.
+    """Show a picture of a record in a window, which is opened if necessary.
 
-    All environments show their pictures in one window, until each `viewer` has called `hide`.
+    All environments share one window, which stays open until each of them has called `hide`.
+
+    Parameters
+    ----------
+    record
+        The samples to draw.
+    fps
+        Most pictures per second: the function waits if the latest picture is too recent.
+    viewer
+        The environment that shows the picture.
     """
     viewers.add(viewer)
     pygame.display.init()
@@ -231,14 +284,14 @@ def show(record: Record, fps: float, viewer: object) -> None:
 
 
 def hide(viewer: object) -> None:
-    """Close the window, unless another environment shows pictures in the window."""
+    """Close the window, unless another environment than `viewer` shows pictures there."""
     viewers.discard(viewer)
     if not viewers:
         pygame.display.quit()
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return some 3 to 7 round numbers from `low` to `high`.
+    """Return the numbers to write on an axis from `low` to `high`: 3 to 7 round numbers.
 
     The numbers are multiples of 1, 2 or 5 times a power of ten.
     """
@@ -251,7 +304,7 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def _two_decimals(value: float) -> str:
-    """Return a number with two decimals, never -0.00; a large one with three digits."""
+    """Return a number as text with two decimals, never "-0.00"; from 1e5 on, three digits."""
     if abs(value) < 1e5:
         return f"{round(value, 2) + 0.0:.2f}"
     return f"{value:.3g}"

@@ -1,4 +1,7 @@
-"""Draw plant numbers, and give every episode of a plant its own place in streams of draws."""
+"""Draw plant numbers, and give every episode of a plant its own random numbers.
+
+The plant numbers are the fields of `PlantNumbers`, such as delay and dead zone.
+"""
 
 from __future__ import annotations
 
@@ -12,28 +15,37 @@ from numpy.typing import NDArray
 
 from mptc_gym.parameters import PLANT_NUMBERS, Parameters, PlantNumbers
 
-Values = NDArray[np.float64]  # one per plant, shape (n,), or one for all plants, shape ()
+Values = NDArray[np.float64]  # one element per plant, shape (n,), or shape () for all plants
 
-DRAWS = 32  # random numbers that an episode reserves for present and future plant numbers
+# Random numbers that each episode reserves for plant numbers: more than the present 13, so that
+# a new plant number does not change the random numbers that follow.
+DRAWS = 32
 # The state of a PCG64 that has just been created, apart from its position in the stream.
 _PCG64 = {"bit_generator": "PCG64", "has_uint32": 0, "uinteger": 0}
-_ANY_SEED = np.random.SeedSequence(0)  # of generators whose state is set afterwards
+# The seed of generators whose state is replaced at once: making a seed anew takes time.
+_ANY_SEED = np.random.SeedSequence(0)
 
 
 class EpisodeStream:
     """A stream of random numbers in which every episode has its own starting point.
 
-    Episode j begins j * 2**64 draws into the stream, however many draws the episodes before it
-    have used. So the j-th episode after a seed always gets the same draws.
+    Episode j begins j * 2**64 random numbers into the stream, however many random numbers the
+    earlier episodes have used. So the j-th episode after a seed always gets the same random
+    numbers.
 
-    The arguments are those of the `numpy.random.SeedSequence` that starts the stream. The
-    generator is created at the first episode, because many plants have streams that are never
-    used.
+    The generator is created at the first episode, because many plants have streams that are
+    never used.
+
+    Parameters
+    ----------
+    entropy, spawn_key, pool_size
+        The arguments of the `numpy.random.SeedSequence` from which the stream starts.
 
     Attributes
     ----------
     generator : numpy.random.Generator
-        The generator of the present episode.
+        The generator of the present episode. The attribute does not exist before the first
+        episode.
     """
 
     # Without a dict per stream, the streams of 100,000 plants take little memory.
@@ -46,7 +58,7 @@ class EpisodeStream:
         self._episode = 0
 
     def __deepcopy__(self, memo: dict[int, Any]) -> EpisodeStream:
-        """Return a copy at the same place in the stream, in a tenth of a plain copy's time."""
+        """Return a copy at the same place in the stream, faster than `copy.deepcopy` alone."""
         duplicate = copy(self)
         if hasattr(self, "generator"):
             bits: Any = np.random.PCG64(_ANY_SEED)
@@ -55,7 +67,7 @@ class EpisodeStream:
         return duplicate
 
     def next_episode(self) -> np.random.Generator:
-        """Move to the start of the next episode and return the generator there."""
+        """Move to the start of the next episode and return the number generator there."""
         if self._episode == 0:
             entropy, spawn_key, pool_size = self._seeds
             seeds = np.random.SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size)
@@ -71,19 +83,23 @@ class EpisodeStream:
 
 
 class Streams(NamedTuple):
-    """All streams of one plant.
+    """All random number streams of one plant.
 
-    A new stream would come last, so that the numbers of the present streams do not change.
+    A further stream must be added at the end, so that the random numbers of the existing
+    streams stay the same.
     """
 
     noise: EpisodeStream
     setpoint: EpisodeStream
-    plant: EpisodeStream  # first the plant numbers, then the disturbance
+    plant: EpisodeStream  # in each episode, first the plant numbers, then the load disturbance
     measurement_noise: EpisodeStream
 
     @classmethod
     def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
-        """Return streams that start at new children of a seed sequence."""
+        """Return streams that start at new children of the seed sequence `seeds`.
+
+        Each call spawns further children, so that each call returns other streams.
+        """
         children = seeds.spawn(len(cls._fields))
         return cls(
             *(
@@ -94,34 +110,51 @@ class Streams(NamedTuple):
 
     @classmethod
     def of_seed(cls, seed: int) -> Streams:
-        """Return the streams that `spawn` returns for `SeedSequence(seed)`, but faster."""
+        """Return the streams that `spawn` first returns for `SeedSequence(seed)`, faster."""
         return cls(*(EpisodeStream(seed, (child,)) for child in range(len(cls._fields))))
 
 
 class Ranges:
-    """Draw the plant numbers that are ranges, uniformly, with both ends of an integer's range.
+    """Draw the plant numbers that are ranges, uniformly, at the start of each episode.
 
-    Every plant number has its own random number, whether it is a range or not. So the draws of
-    the other plant numbers do not change if one more becomes a range.
+    Numbers between two floats are drawn from [low, high), and integers from low to high, both
+    included. Every plant number has its own random number, whether the plant number is a range
+    or not. So the other plant numbers of a seed do not change if one more plant number becomes
+    a range.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment, of which the plant numbers may be ranges.
 
     Attributes
     ----------
     lowest : PlantNumbers
-        All plant numbers, with the low end of a range, in arrays of shape ().
+        All plant numbers, each range replaced by its low end, in arrays of shape ().
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._ranges = parameters.ranges
-        # The disturbance takes random numbers from the same stream, after the random numbers of
-        # the plant numbers.
+        # The load disturbance takes random numbers from the stream `Streams.plant`, too, after
+        # the random numbers that are reserved for the plant numbers.
         self._uses_stream = bool(self._ranges) or parameters.is_disturbed
         lowest = {name: np.array(number) for name, number in vars(parameters.lowest).items()}
         self.lowest: PlantNumbers[Values] = PlantNumbers(**lowest)
 
     def draw(self, streams: Sequence[Streams]) -> PlantNumbers[Values]:
-        """Begin the next episode of some plants with these streams, and return their numbers.
+        """Begin the next episode of some plants, and return the plant numbers of this episode.
 
-        Numbers that are ranges have the shape (len(streams),), and the others the shape ().
+        Parameters
+        ----------
+        streams
+            The streams of each of these plants. The method begins the next episode of the
+            stream `plant` if a plant number or the load is random.
+
+        Returns
+        -------
+        PlantNumbers
+            Plant numbers that are ranges, drawn, in arrays of shape (len(streams),), and the
+            other plant numbers in arrays of shape ().
         """
         if not self._uses_stream:
             return self.lowest
@@ -139,9 +172,15 @@ class Ranges:
 
 
 def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
-    """Return the numbers of plant i as Python numbers, given the numbers of many plants.
+    """Return the plant numbers of one of many plants, as Python numbers.
 
-    Numbers that all plants share have the shape ().
+    Parameters
+    ----------
+    numbers
+        The plant numbers of many plants, in arrays of shape (n,), or of shape () for a number
+        that all plants share.
+    i
+        The index of the plant.
     """
     numbers_of_plant: dict[str, float] = {}
     for name, values in vars(numbers).items():

@@ -23,7 +23,7 @@ from mptc_gym.record import Record
 from mptc_gym.signals import ONE, Signals
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys of every info
-_FLOAT32 = np.dtype(np.float32)  # faster to pass than the type
+_FLOAT32 = np.dtype(np.float32)  # np.fromiter takes a dtype faster than the type np.float32
 NO_MODE = (
     "render does nothing without a render mode: make the environment with a render mode, as in "
     'gymnasium.make("MiddlePoint-v0", render_mode="rgb_array")'
@@ -34,10 +34,11 @@ Action = NDArray[np.float32]
 
 
 def observation_space(parameters: Parameters) -> Space[Observation]:
-    """Return the space of the observation, a `Box` of shape (size,), float32.
+    """Return the space of an observation, a float32 `Box` of shape (size,).
 
     The bounds depend on the set point only if the set point exceeds the transmitter's range, so
-    that a policy trained on one set point can run on another.
+    that a policy trained on one set point can run on another. `parameters` are the arguments of
+    the environment.
     """
     span = parameters.temperature_span
     setpoint = parameters.setpoint
@@ -51,20 +52,22 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
 
 
 class HasPlainSpec:
-    """An environment whose spec can be written as JSON.
+    """An environment whose specification (`EnvSpec`) can be written as JSON.
 
-    The spec holds lists in place of arrays, and Python numbers in place of NumPy's.
+    The specification holds lists in place of NumPy arrays, and Python numbers in place of NumPy
+    scalars.
     """
 
     _spec: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The specification, from which `gymnasium.make` makes such an environment again."""
+        """The `EnvSpec` from which `gymnasium.make` can make an environment like this one."""
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
+        """Store a copy of an `EnvSpec`, with lists and Python numbers for NumPy's types."""
         if spec is not None:
             spec = copy(spec)
             spec.kwargs = {name: plain(value) for name, value in spec.kwargs.items()}
@@ -78,8 +81,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     temperature there, but only after a transport delay of 18 samples of 8 s; the actuator has a
     dead zone and saturates; noise disturbs the temperature. The plant is that of X. Cui and
     K. G. Shin, "Application of neural networks to temperature control in thermal power plants"
-    (1992); numbers in parentheses are its equations. All quantities are deviations from the
-    operating point. `MiddlePointVectorEnv` runs many of these plants at once.
+    (1992), here called the paper; numbers in parentheses, such as (28), are equations of this
+    paper. All temperatures and flows are deviations from the operating point.
+    `MiddlePointVectorEnv` runs many of these plants at once.
 
     ## Plant
 
@@ -90,45 +94,54 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
               n(k) = xi(k) - 0.35740 xi(k-1) - 0.03392 xi(k-2),              xi ~ N(0, R)
         (29)  u_a = 0 where |u| < dead_zone, otherwise u limited to [u_min, u_max]
 
-    y is the temperature (degC), y_d its set point, e = y_d - y the error, u the commanded and
-    u_a the applied feedwater flow (t/h). Call k of `step` (k = 0, 1, ...) applies u(k), moves
-    the plant from sample k to k+1 and returns the observation at k+1 and the reward of e(k+1).
-    So u(0) first shows in y(19).
+    y is the temperature (degC), y_d the set point of the temperature, e = y_d - y the error, u
+    the commanded and u_a the applied feedwater flow (t/h), n the noise (degC), xi the white
+    noise that causes n, and d the delay (samples). Call k of `step` (k = 0, 1, ...) applies the
+    flow u(k), moves the plant from sample k to k+1, and returns the observation at k+1 and the
+    reward of the error e(k+1). So the flow u(0) first shows in the temperature y(19). Equation
+    (28) is also written as A(z^-1) y(k) = B(z^-1) u_a(k-d) + C(z^-1) xi(k), with polynomials A,
+    B and C.
 
-    Section 1 of the paper names further difficulties that (28) does not include. These
-    difficulties are off by default; some of `mptc_gym.PRESETS` turn them on:
+    Section 1 of the paper names further difficulties of a boiler that equation (28) does not
+    include. These difficulties are off by default; some of the argument sets in
+    `mptc_gym.PRESETS` turn the difficulties on:
 
-    - Measurement noise: from k = 1 on, the observation shows y + v with white noise
-      v ~ N(0, measurement_noise_variance). The reward and `info["output"]` use the true y.
-    - A load disturbance w, as when the feedwater's temperature, the coal or the fire's position
-      changes: A(1) w(k) is added to (28), so that a constant w adds w to y in the steady state.
-      The load starts at 0 and changes every 10 samples. The load is the sum of a random walk
-      that gains a variance of `disturbance_walk_variance` per sample, and of steps to levels
-      uniform within +-`disturbance_amplitude`, at random, every `disturbance_interval` samples
-      on average.
+    - Measurement noise: from k = 1 on, the observation shows the reading y + v in place of the
+      temperature y, with white noise v ~ N(0, measurement_noise_variance). The reward and
+      `info["output"]` use the true temperature y.
+    - A load disturbance w (degC), as when the feedwater's temperature, the coal or the fire's
+      position changes: A(1) w(k) is added to the right side of equation (28), so that a
+      constant load w adds w to the temperature in the steady state. The load starts at 0 and
+      changes every 10 samples. The load is the sum of two parts: a random walk that gains a
+      variance of `disturbance_walk_variance` per sample, and steps at random times, every
+      `disturbance_interval` samples on average, to random levels uniform within
+      +-`disturbance_amplitude`.
     - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times
-      the dominant time constant. With p the slowest pole (0.9515), A = (1 - p z^-1) Q(z^-1),
-      and the time constant is 1 / (1 - p) = 20.6 samples. For t times the time constant and g
-      times the gain, 1 - p is divided by t, Q stays, and B is multiplied by g / t.
+      the dominant time constant. With p = 0.9515 the slowest pole of equation (28), the
+      polynomial A is (1 - p z^-1) Q(z^-1), and the time constant is 1 / (1 - p) = 20.6 samples.
+      For t times the time constant and g times the gain, the number 1 - p is divided by t, the
+      polynomial Q stays, and the polynomial B is multiplied by g / t.
     - Fouling: in `drift_samples` samples, gain and time constant drift linearly to `gain_drift`
-      and `time_constant_drift` times their values at k = 0. The drifting values change every 10
-      samples.
+      and `time_constant_drift` times the gain and the time constant at k = 0. The drifting
+      values change every 10 samples.
 
     ## Action space
 
-    `Box(-1, 1, (1,), float32)`: u = u_min + (a + 1) / 2 * (u_max - u_min).
+    `Box(-1, 1, (1,), float32)`: an action a commands the flow
+    u = u_min + (a + 1) / 2 * (u_max - u_min), in t/h.
 
     | Index | Action | at -1 | at 1 | Unit |
     |---|---|---|---|---|
     | 0 | feedwater flow u | u_min = -10 | u_max = 10 | t/h |
 
-    An action outside the box is a command outside the range, which the actuator limits.
+    An action below -1 or above 1 commands a flow outside the range from `u_min` to `u_max`,
+    which the actuator limits to this range.
 
     ## Observation space
 
-    The observation space is a 1-D float32 `Box` with the following blocks, each with the newest
-    sample first. In the table, `y` is the transmitter's reading, which saturates at
-    +-`temperature_span`.
+    The observation is a 1-D float32 array that joins four blocks, each with the newest sample
+    first. In this table, y is the transmitter's reading of the temperature, which saturates at
+    +-`temperature_span`, and e is y_d minus this reading.
 
     | Block | Elements (default) | Bounds (default) | Unit |
     |---|---|---|---|
@@ -138,8 +151,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     | actions a(k-1), a(k-2), ... | `action_window` (0) | +-1 | 1 |
 
     The defaults give the six inputs of the paper's neural network. Past actions are clipped to
-    +-1, as the actuator limits them. With `action_window=delay+2` the noise-free problem is
-    Markov while the set point holds. If the set point can exceed the transmitter's range, the
+    +-1, as the actuator limits the commands of actions beyond +-1. With
+    `action_window=delay+2`, the problem without noise is a Markov decision process as long as
+    the set point stays constant. If the set point can exceed the transmitter's range, the
     bounds of set points and errors widen to include the set point.
 
     ## Reward
@@ -149,46 +163,48 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     | "quadratic" | -(e(k+1) / error_scale)^2 / 2 - move_weight * abs(a(k) - a(k-1)) |
     | "absolute" | -abs(e(k+1)) / error_scale - move_weight * abs(a(k) - a(k-1)) |
 
-    "quadratic" is the negative of the paper's cost (12), scaled. The best possible reward of a
-    step is 0. With the default set point, a plant without input earns -0.5 per step. There is
-    no lower bound, since e is the error of the true temperature, which the transmitter's range
-    does not limit.
+    The reward "quadratic" is the negative of the cost in equation (12) of the paper, scaled.
+    The best possible reward of a step is 0. With the default set point, a plant whose feedwater
+    flow stays 0 earns -0.5 per step. The reward has no lower bound, since e is the error of the
+    true temperature, which the transmitter's range does not limit.
 
     ## Starting state
 
-    Before k = 0 the plant has been at rest: y, y_d, e, u, u_a and xi are all 0, so y(0) = 0.
-    All randomness comes from the seed, in separate streams, so that every controller meets the
-    same noise, set point, disturbance and plant. The j-th episode after a seed does not depend
-    on the length of earlier episodes. `reset` has no options.
+    Before sample k = 0, the plant has been at rest: temperature y, set point y_d, error e,
+    flows u and u_a, and white noise xi are all 0, so that y(0) = 0. All random numbers come
+    from the seed, in separate streams, so that every controller meets the same noise, set
+    point, load and plant. The j-th episode after a seed does not depend on the length of
+    earlier episodes. `reset` has no options.
 
     ## Episode end
 
-    Nothing terminates an episode. `gymnasium.make` truncates an episode after 1200 steps.
+    No episode terminates. `gymnasium.make` truncates an episode after 1200 steps.
 
     ## Arguments
 
     All arguments are keyword-only and can be given to `gymnasium.make`. An asterisk marks an
     argument that can also be a range [low, high], from which each `reset` draws a number
-    uniformly (an integer where the default is an integer). The arguments are declared in
-    `mptc_gym/parameters.py`.
+    uniformly (an integer where the default is an integer). In the table, U_min and U_max are
+    the paper's symbols, and A, B, C and xi those of equation (28).
 
     <arguments>
 
-    `render_mode` is None, "human" or "rgb_array"; see Rendering. Lists may also be tuples or
-    NumPy arrays. Numbers are within +-1e9, the delay and each window are at most 10,000
-    samples, and `a`, `b` and `c` have at most 1,000 coefficients each.
+    `render_mode` is None, "human" or "rgb_array"; see Rendering. In place of lists, arguments
+    may be tuples or NumPy arrays. Numbers must be within +-1e9, the delay and each window may
+    have at most 10,000 samples, and `a`, `b` and `c` at most 1,000 coefficients each.
 
     ## Info
 
     `reset` and `step` return a new dict of floats: `output` (the true y, degC), `setpoint`
     (y_d, degC), `error` (y_d - y, degC), `command` (u, t/h), `applied` (u_a, t/h) and `noise`
-    (n, degC). After a step, `command` and `applied` belong to the step, and the other values
-    belong to the sample to which the step leads. At reset, `command`, `applied` and `noise` are
-    0.
+    (n, degC). After the step from sample k to k+1, `command` and `applied` are those of the
+    step, u(k) and u_a(k), and the other values are those of sample k+1. At reset, `command`,
+    `applied` and `noise` are 0.
 
-    With a load disturbance, the dict also holds `disturbance` (w, degC), and with a drift, the
-    present `gain_factor` and `time_constant_factor`. The dict of `reset` also holds each number
-    that was drawn, under its name; a delay is an int.
+    With a load disturbance, the info also holds `disturbance` (w, degC). With a drift, the info
+    also holds the present `gain_factor` and `time_constant_factor`. The info of `reset` also
+    holds the number that was drawn for each argument that is a range, under the argument's
+    name; a delay is an int.
 
     ## Rendering
 
@@ -197,15 +213,16 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     | "rgb_array" | returns a picture, shape (540, 960, 3), uint8 |
     | "human" | shows the picture in a window, as do `reset` and `step`, at most `metadata["render_fps"]` times a second |
 
-    A picture shows the last 200 samples, or more if the delay is long: set point and true
-    temperature; commanded and applied flow, with the dead zone, the limits and the time in
-    which the flow is still in transit to the middle point. Pictures need pygame:
+    A picture shows the latest 200 samples, or more if the delay is long. The upper panel shows
+    set point and true temperature. The lower panel shows commanded and applied flow, the dead
+    zone, the limits, and the time in which the flow is still in transit to the middle point.
+    Pictures need pygame:
     `pip install "mptc_gym[render]"`. Gymnasium's `RecordVideo` also needs moviepy.
 
     ## Errors
 
     For an invalid argument or `render_mode`, the constructor raises a `ValueError` that names
-    the argument. For a misspelt argument, the constructor raises a `TypeError`. If an action is
+    the argument. For an unknown argument, the constructor raises a `TypeError`. If an action is
     not one finite number, `step` raises a `ValueError` and leaves the plant unchanged. Without
     pygame, the first picture raises `DependencyNotInstalled`.
 
@@ -224,22 +241,24 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         one_of("render_mode", render_mode, [None, *self.metadata["render_modes"]])
         self.parameters = parameters
         self.render_mode = render_mode
-        self._record: Record | None = None  # for pictures; None without a render mode
+        self._record: Record | None = None  # samples for pictures; None without a render mode
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)
         # `step` unpacks two tuples, which is faster than reading as many attributes.
         quadratic = parameters.reward == "quadratic"
         self._reward_terms = parameters.error_scale, quadratic, parameters.move_weight
-        # The places where errors, outputs and actions begin in the observation, and the size of
-        # the observation.
+        # The indices at which errors, outputs and actions begin in the observation, and the
+        # number of elements of the observation.
         places = np.cumsum(parameters.windows).tolist()
         self._layout = parameters.temperature_span, *places
         self._has_more_info = parameters.is_disturbed or parameters.drifts
         self._ranges = Ranges(parameters)
         self._signals = Signals.of(parameters)
-        self._streams: list[Streams] = []  # of the only plant; empty before the first reset
-        self._root: np.random.Generator | None = None  # from which the streams were spawned
-        # y_d, n, w and the measurement noise of the samples to come, the next sample last.
+        # Random number streams of the only plant; empty before the first reset.
+        self._streams: list[Streams] = []
+        self._root: np.random.Generator | None = None  # whose seed the streams come from
+        # Set point y_d, noise n, load w and measurement noise, degC, of the samples to come,
+        # the next sample last.
         self._ahead: list[tuple[float, ...]] = []
 
     # Only `Parameters` lists the arguments; this signature shows them in help() and in editors.
@@ -253,17 +272,17 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         Parameters
         ----------
         seed
-            Restarts the environment's random streams. Without a seed, the next episode of the
-            present streams begins.
+            Restarts the environment's random number streams. Without a seed, the next episode
+            of the present streams begins.
         options
             Not used.
 
         Returns
         -------
         observation : ndarray of float32
-            The observation at k = 0, shape (size,).
-        info : dict
-            The info at k = 0.
+            The observation at sample k = 0, shape (size,), laid out as in the class docstring.
+        info : dict of float
+            The info at sample k = 0, and the numbers that were drawn for ranges.
         """
         super().reset(seed=seed)
         if self._root is not self.np_random:
@@ -276,13 +295,13 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         self._plant = Plant(self.parameters, numbers)
         self._ahead.clear()
 
-        # At rest u is 0, whichever action that is.
+        # At rest, the commanded flow is 0 t/h. The action for 0 t/h depends on the limits.
         self._action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         rest_action = _limited(self._action, 1.0)
         _, error_place, output_place, action_place, size = self._layout
-        # `step` needs one more element at the end.
+        # `step` writes to one more element after the end of the observation.
         self._window = [0.0] * action_place + [rest_action] * (size - action_place + 1)
-        # An empty block begins where the next block does, which is written later.
+        # A block of size 0 begins where the next block does, whose element is written later.
         self._window[0] = setpoint
         self._window[error_place] = setpoint
         self._window[output_place] = 0.0
@@ -306,36 +325,36 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         Parameters
         ----------
         action
-            a(k), shape (1,).
+            The action a(k), shape (1,): -1 commands the flow `u_min`, and 1 commands `u_max`.
 
         Returns
         -------
         observation : ndarray of float32
-            The observation at k+1, shape (size,).
+            The observation at sample k+1, shape (size,).
         reward : float
-            The reward of e(k+1).
+            The reward of the error e(k+1).
         terminated, truncated : bool
-            Always False.
+            Always False: `gymnasium.make` adds the time limit.
         info : dict of float
-            The info at k+1.
+            The info at sample k+1.
 
         Raises
         ------
         ValueError
-            If the action is not one finite number. The plant is then unchanged.
+            If the action is not one finite number. The error leaves the plant unchanged.
         ResetNeeded
-            Before the first reset.
+            If `step` is called before the first `reset`.
         """
         # The speed of the environment depends on this method, so it avoids function calls.
         try:
-            a = float(action.item() - 0.0)  # the difference fails for text such as "0.3"
+            a = float(action.item() - 0.0)  # subtracting 0.0 fails for text such as "0.3"
         except (AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
             a = one_action(action)
         observed_action = a
         if not -1.0 <= a <= 1.0:
             observed_action = _limited(a, 1.0)
             if not math.isfinite(a):
-                one_action(a)  # raises a ValueError
+                one_action(a)  # raises a ValueError, as the action is not finite
         if not self._ahead:
             if not self._streams:
                 raise ResetNeeded("call reset before step")
@@ -347,7 +366,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         command, applied, output = self._plant.step(a, noise, load)
         error = setpoint - output
         scaled = error / error_scale
-        reward = scaled * scaled * -0.5 if quadratic else -abs(scaled)  # (12)
+        # The paper's cost, equation (12), negated, or the magnitude of the error, negated.
+        reward = scaled * scaled * -0.5 if quadratic else -abs(scaled)
         if move_weight:
             reward -= move_weight * abs(a - self._action)
         self._action = a
@@ -355,10 +375,11 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         measured = output + transmitter_noise
         if not -span <= measured <= span:
             measured = _limited(measured, span)
-        # One insertion shifts all blocks by one place. The oldest element of a block moves to
-        # the first place of the next block, where the new sample overwrites it. An empty block
-        # begins where the next block does, which is written later; an empty last block begins
-        # at the additional element at the end.
+        # One insertion shifts all blocks of the observation by one place. The oldest element of
+        # a block moves to the first place of the next block, where the new sample overwrites
+        # the oldest element. A block of size 0 begins where the next block does, whose element
+        # is written later; if the last block has size 0, the last block begins at the
+        # additional element at the end of the list.
         window = self._window
         window.insert(0, setpoint)
         window.pop()
@@ -385,7 +406,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         return observation, reward, False, False, info
 
     def render(self) -> Frame | None:
-        """Draw the last samples of the episode.
+        """Return or show a picture of the latest samples of the episode.
 
         Returns
         -------
@@ -397,7 +418,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         Raises
         ------
         ResetNeeded
-            Before the first reset.
+            If `render` is called before the first `reset`.
         DependencyNotInstalled
             If pygame is not installed.
         """
@@ -414,7 +435,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         return None
 
     def close(self) -> None:
-        """Close the window, unless another environment shows its pictures in this window."""
+        """Close the window, unless another environment still shows pictures in the window."""
         if self.render_mode == "human" and self._record is not None:
             from mptc_gym import drawing  # which needs pygame
 
@@ -426,5 +447,5 @@ MiddlePointEnv.__doc__ = insert_table(MiddlePointEnv.__doc__)
 
 
 def _limited(value: float, limit: float) -> float:
-    """Limit a value to +-limit; by this order of min and max, NaN becomes the limit."""
+    """Return a value, limited to +-`limit`; NaN becomes the upper limit."""
     return max(-limit, min(limit, value))

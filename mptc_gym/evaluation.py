@@ -1,4 +1,4 @@
-"""Score any policy on fixed episodes, in the environments that it is to act in."""
+"""Score any policy on fixed episodes, in the environments in which the policy is to act."""
 
 from __future__ import annotations
 
@@ -25,46 +25,56 @@ from mptc_gym.vector_env import MiddlePointVectorEnv
 
 Values = NDArray[np.float64]  # one number for each episode, shape (episodes,)
 
-SEED: Final = 7_000_000  # of the first published episode; the next episode has the next seed
-EPISODES: Final = 100
-VALIDATION_SEED: Final = 5_000_000  # of the first episode to choose by, which no result shows
-VALIDATION_EPISODES: Final = 200
-SAMPLES: Final = 1200  # of an episode, unless its environment ends it earlier
+# The seed of the first of the episodes behind published scores; episode i has the seed SEED +
+# i. The value is arbitrary, but never changes, so that scores stay comparable.
+SEED: Final = 7_000_000
+EPISODES: Final = 100  # episodes of a published score
+# The seed of the first of the episodes for choosing among policies, which no published score
+# uses; episode i has the seed VALIDATION_SEED + i.
+VALIDATION_SEED: Final = 5_000_000
+VALIDATION_EPISODES: Final = 200  # episodes for which the package has bounds
+SAMPLES: Final = 1200  # samples of an episode, unless the environment ends the episode earlier
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
-# Arguments that change observations or rewards, but not the least possible error.
+# The arguments of an environment that change observations or rewards, but not the least
+# possible error of a controller.
 _NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
-_RESAMPLES: Final = 2000  # of the episodes, for the bootstrap interval
+_RESAMPLES: Final = 2000  # how often episodes are resampled for the bootstrap interval
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
-    """The result of `evaluate`. Its text is one line.
+    """The result of `evaluate`: errors, scores and valve travel of a policy.
+
+    `str` of an evaluation is a summary in one line.
 
     Attributes
     ----------
     env : str
-        The id of the environment, or the name of its class if it has no id.
+        The id of the environment, or the name of the class of an environment without an id.
     mean_error, travel : float
-        Means of `errors` and `travels`.
+        Means of `errors`, degC, and of `travels`, t/h, over all episodes.
     errors, travels : ndarray, shape (episodes,)
-        Mean of |e(k)| over k = 1 to N, degC, and distance that the valve moves, t/h.
+        For each episode, the mean error, that is the mean of |e(k)| over the samples k = 1 to
+        N, degC, with the error e of the temperature; and the valve travel, that is the sum of
+        the magnitudes of all changes of the applied flow, t/h.
     seeds : range
         Seeds of the episodes.
     note : str
         Why there is no score, or why the score is 0, and what to do. The note is empty if there
         is a score other than 0.
     least_possible : float or None
-        Least possible mean error, degC. This and all following attributes are None where the
-        package has no bound: `note` says why.
+        Least possible mean error of any controller, degC. `least_possible`, `multiple`,
+        `score`, `interval`, `least` and `scores` are None where the package has no bound:
+        `note` says why.
     multiple : float or None
         `mean_error / least_possible`.
     score : float or None
-        0 for the error of a valve that never moves, 1 for the least possible error.
+        0 for the mean error of a valve that never moves, 1 for the least possible mean error.
     interval : (float, float) or None
         95 % bootstrap interval of the score, from resampled episodes.
     least, scores : ndarray or None, shape (episodes,)
         Least possible mean error of each episode, degC, and score of each episode. Where only
-        noise and load are drawn, `least` is the expected value over noise and load.
+        noise and load are random, `least` is the expected value over noise and load.
     """
 
     env: str
@@ -104,12 +114,13 @@ def evaluate(
     seed: int = SEED,
     **arguments: Any,
 ) -> Evaluation:
-    """Run a policy on fixed episodes and score it.
+    """Run a policy on fixed episodes and return errors, score and valve travel.
 
     As with `evaluate_policy` of Stable-Baselines3, the policy acts in exactly the environments
-    that are handed over: the windows, wrappers and statistics of these environments must be
-    those of the policy's training. The policy acts in a copy, so that the environments do not
-    change. A training may therefore score its model in the environments of the training.
+    that are passed as `env`: the windows of the observation, the wrappers, and the statistics
+    of wrappers that normalise must be those of the policy's training. The policy acts in a copy
+    of the environments, which themselves do not change. A training may therefore score its
+    model in the environments of the training.
 
     Parameters
     ----------
@@ -117,30 +128,34 @@ def evaluate(
         A policy has one of four forms:
 
         - an object with `predict`, such as a model of Stable-Baselines3; `predict` receives
-          `state`, `episode_start` and `deterministic=True`, if it takes these arguments;
-        - an object with `act`, such as a controller in `agents`; `act` takes observations and
-          returns actions in NumPy arrays;
-        - a `torch.nn.Module`, or a method of a module; it receives a tensor of the type of the
-          module's weights; the module is in evaluation mode, and computes no gradients;
+          `state`, `episode_start` and `deterministic=True`, as far as `predict` has these
+          arguments;
+        - an object with `act`, such as a controller in `agents`; `act` takes observations,
+          shape (n, size), and returns actions, shape (n, 1), in NumPy arrays;
+        - a `torch.nn.Module`, or a method of a module; the module receives the observations in
+          a tensor of the type of the module's weights; meanwhile, the module is in evaluation
+          mode, and computes no gradients;
         - any other function of observations, shape (n, size), that returns actions, shape
           (n, 1), in NumPy arrays.
 
-        A bound `predict` or `act` stands for its object, and a `functools.partial` for its
-        function. If the object has a method `reset`, this method is called before each round of
-        episodes. What a policy learns in an evaluation stays with the policy.
+        A bound method `predict` or `act` stands for the object of the method, and a
+        `functools.partial` for the function within the partial. If the policy has a method
+        `reset`, this method is called before each round of episodes. What a policy learns in an
+        evaluation stays with the policy.
     env
         An id, such as one of `IDS`, or an `EnvSpec`; a function that makes one environment in
         each call; or environments: a single environment, a vector environment of Gymnasium, or
         a `VecEnv` of Stable-Baselines3, such as `model.get_env()`. If there are fewer
         environments than `episodes`, the environments run several rounds.
 
-        Environments in other processes, in a window, or with anything else that cannot be
-        copied act themselves, and begin a new episode afterwards. A ValueError is raised if the
-        policy is a model that trains in such environments. Original and copy share files that
-        they open by name, global random streams, and variables to which functions refer.
+        Environments that cannot be copied, such as those in other processes or with a window,
+        are used themselves, and begin a new episode after the evaluation. A ValueError is
+        raised if the policy is a model that trains in environments that cannot be copied.
+        Original and copy share files that are opened by name, global random number generators,
+        and variables to which functions refer.
     episodes
-        Number of episodes, at least 2. An episode has 1,200 samples, or fewer if its
-        environment ends it earlier.
+        Number of episodes, at least 2. An episode has 1,200 samples, or fewer if the
+        environment ends the episode earlier.
     seed
         Seed of the first episode; the next episode has the next seed. The default is the seed
         of all published scores. To choose among policies, import `VALIDATION_SEED` from
@@ -151,15 +166,16 @@ def evaluate(
     Returns
     -------
     Evaluation
-        Mean error, score and valve travel, also of each episode in arrays, shape (episodes,).
+        Mean error, score and valve travel of the policy, over all episodes in numbers, and of
+        each episode in arrays of shape (episodes,).
 
     Raises
     ------
     ValueError
-        If the environment does not exist, is not of this package or runs other episodes than
-        those of its seeds; or if the policy or its actions do not fit the environment. If a
-        model of Stable-Baselines3 still has the environments of its training, `env` must have
-        the same windows, and wrappers of the same names.
+        If the environment does not exist, is not of this package, or runs other episodes than
+        those that belong to the seeds; or if the policy or the policy's actions do not fit the
+        environment. If a model of Stable-Baselines3 still has the environments of its training,
+        `env` must have the windows of these environments, and wrappers of the same names.
 
     Examples
     --------
@@ -168,7 +184,8 @@ def evaluate(
     MiddlePoint-v0: mean error 6.613 degC, 7.26 times the least possible; score -0.394; \
 valve travel 10 t/h; 100 episodes, all alike
 
-    A model of Stable-Baselines3 acts in its own environments, or in others like them:
+    A model of Stable-Baselines3 acts in its own environments, or in other environments with the
+    same windows and wrappers:
 
     >>> from mptc_gym.sb3 import make_vec_env, spec_of
     >>> from stable_baselines3 import PPO
@@ -204,18 +221,31 @@ valve travel 10 t/h; 100 episodes, all alike
 
 
 class _Runs(NamedTuple):
-    """What the episodes of a policy are scored by."""
+    """Errors and valve travels of a policy's episodes, from which the score is computed."""
 
-    errors: Values  # mean of |e(k)|, degC
-    travels: Values  # of the valve, t/h
-    samples: int  # N, of each episode
+    errors: Values  # mean of |e(k)| of each episode, degC, with e the error of the temperature
+    travels: Values  # sum of the changes of the applied flow in each episode, t/h
+    samples: int  # number of samples N of each episode
 
 
 def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _Runs:
-    """Run an episode for each seed, in as many rounds as the number of plants requires.
+    """Run an episode of a policy for each seed, in rounds of as many episodes as plants.
 
-    `parameters` are those of the plants. A ValueError is raised if episodes have different
-    lengths, or if they are not those of the seeds.
+    Parameters
+    ----------
+    policy
+        A policy, as in `evaluate`.
+    plants
+        A vector environment in which the policy acts.
+    seeds
+        The seeds of the episodes.
+    parameters
+        The arguments of the plants.
+
+    Raises
+    ------
+    ValueError
+        If episodes have different lengths, or if the episodes are not those of the seeds.
     """
     n = plants.num_envs
     rounds: list[_Runs] = []
@@ -234,11 +264,14 @@ def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _
 
 
 def _measure(samples: Iterator[Sample], n: int) -> _Runs:
-    """Sum up the samples of n episodes until these end; ValueError if not all end at once."""
-    next(samples)  # k = 0, before which no policy has acted
+    """Return errors and valve travels of n episodes, whose samples are `samples`.
+
+    A ValueError is raised if not all episodes end at the same sample.
+    """
+    next(samples)  # sample k = 0, which no policy has affected
     total_errors = np.zeros(n)
     travels = np.zeros(n)
-    applied = np.zeros(n)  # t/h, at rest
+    applied = np.zeros(n)  # applied flow, t/h, which is 0 at rest
     length = 0
     for sample in samples:
         length += 1
@@ -253,11 +286,15 @@ def _measure(samples: Iterator[Sample], n: int) -> _Runs:
 
 
 def _refuse_lengths(samples: int) -> NoReturn:
+    """Raise a ValueError: episodes differ in length, and one has `samples` samples."""
     raise ValueError(f"env must end all episodes at once, got an end after {samples} samples")
 
 
 def _why_idle(runs: _Runs, parameters: Parameters) -> str:
-    """Return why the valve has never moved, and what helps; "" if the valve has moved."""
+    """Return why the valve has never moved, and what helps; "" if the valve has moved.
+
+    `runs` are the results of the episodes, and `parameters` the arguments of the plants.
+    """
     if runs.travels.any():
         return ""
     low, high = parameters.range_of("dead_zone")
@@ -271,21 +308,21 @@ def _why_idle(runs: _Runs, parameters: Parameters) -> str:
 
 
 class Bound(NamedTuple):
-    """The least possible mean error of each episode, or the reason why it is missing."""
+    """The least possible mean error of each episode, or why the package has no bound."""
 
-    least: Values | None  # degC
-    why_not: str = ""
+    least: Values | None  # least possible mean error of each episode, degC, shape (episodes,)
+    why_not: str = ""  # why `least` is None
 
 
 def find_bound(parameters: Parameters, samples: int, seeds: range) -> Bound:
-    """Return the least possible mean error of each episode, if the package has it.
+    """Return the least possible mean error of each episode, or why the package has none.
 
     Parameters
     ----------
     parameters
         The arguments of the plants.
     samples
-        Length N of an episode.
+        Number of samples N of an episode.
     seeds
         The seeds of the episodes.
     """
@@ -302,7 +339,7 @@ def find_bound(parameters: Parameters, samples: int, seeds: range) -> Bound:
             f"bounds are kept for episodes of {SAMPLES:,} samples, not of {samples:,}: leave "
             "max_episode_steps as it is",
         )
-    if len(least_by_seed[SEED]) == 1:  # the same for all seeds: only noise and load are drawn
+    if len(least_by_seed[SEED]) == 1:  # one bound for all seeds: only noise and load are random
         return Bound(np.repeat(least_by_seed[SEED], len(seeds)))
     ranges = []
     for first, least in least_by_seed.items():
@@ -318,10 +355,15 @@ def find_bound(parameters: Parameters, samples: int, seeds: range) -> Bound:
 
 @cache
 def _read_bounds() -> dict[Parameters, dict[int, Values]]:
-    """Return the bounds that `python -m benchmarks.bounds --package` wrote.
+    """Return the bounds that `python -m benchmarks.bounds --package` wrote to `bounds.json`.
 
-    The bounds are by case, and of a case by the seed of the first episode: least possible mean
-    errors of this episode and of the next ones, degC.
+    Returns
+    -------
+    dict of dict of ndarray
+        Least possible mean errors, degC. The outer key is the case: the arguments of the
+        plants, as `case_of` returns the arguments. The inner key is the seed of the first
+        episode: element i of the array belongs to this seed + i; an array of one element
+        belongs to all seeds.
     """
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
     bounds = {}
@@ -334,14 +376,17 @@ def _read_bounds() -> dict[Parameters, dict[int, Values]]:
 
 
 def case_of(parameters: Parameters) -> Parameters:
-    """Return parameters, with those that do not affect the bound at their defaults."""
+    """Return arguments of plants, with defaults for those that do not affect the bound.
+
+    Plants of the same case have the same least possible errors.
+    """
     return replace(parameters, **{name: ARGUMENTS[name].default for name in _NO_MATTER})
 
 
 def _judge(
     errors: Values, least: Values, parameters: Parameters, seeds: range
 ) -> dict[str, Any]:
-    """Return the fields of an `Evaluation` that compare errors with the least possible ones.
+    """Return the fields of an `Evaluation` that compare errors with least possible errors.
 
     Parameters
     ----------

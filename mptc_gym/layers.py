@@ -1,4 +1,8 @@
-"""Look into environments of any kind: their layers, their plants and their wrappers."""
+"""Look into environments of any kind: their layers, their plants and their wrappers.
+
+A layer is one environment object in a nesting: a wrapper, a vector environment or an innermost
+environment.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +18,11 @@ from mptc_gym.parameters import Parameters
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
 VEC_ENV: Final = "stable_baselines3.common.vec_env"
-# The attributes in which environments of Gymnasium, Stable-Baselines3 and this package hold
-# the environments within them.
+# The attributes in which a wrapper or vector environment of Gymnasium, Stable-Baselines3 or
+# this package holds inner environments.
 INNER: Final = ("venv", "env", "envs", "batches")
-# Layers that change neither observations nor actions, by the name of their class.
+# Class names of layers that may differ between a policy's training and an evaluation: these
+# layers leave actions as they are, and leave observations as they are or add noise.
 _NEUTRAL: Final = frozenset({
     "MiddlePointEnv",
     "AsyncVectorEnv", "DummyVecEnv", "GymnasiumVecEnv", "SubprocVecEnv", "SyncVectorEnv",
@@ -30,36 +35,43 @@ _NEUTRAL: Final = frozenset({
 
 
 class PlantGroup(NamedTuple):
-    """Plants with the same arguments and wrappers: one environment, or one batch."""
+    """Plants with the same arguments and wrappers: one environment, or one batch of plants."""
 
     parameters: Parameters
     num_envs: int
-    name: str  # id of the environment, or the name of its class if it has no id
+    name: str  # id of the environment, or the name of the class of an environment without an id
     # The classes of the wrappers that change observations or actions, outermost first.
     wrappers: tuple[str, ...]
 
 
 def loaded(name: str) -> Any:
-    """Return the class with this full name, or () if its module has not been imported.
+    """Return the class with the full name `name`, or () if its module has not been imported.
 
-    The result is the second argument of an `isinstance`, which is False for ().
+    The result is the second argument of an `isinstance`, which is False for (). So an optional
+    package need not be imported to recognise objects of the package.
     """
     module, _, class_name = name.rpartition(".")
     return getattr(sys.modules.get(module), class_name, ())
 
 
 def is_environment(env: Any) -> bool:
-    """Whether `env` is an environment or several, of Gymnasium or of Stable-Baselines3."""
+    """Whether `env` is an environment or a vector environment.
+
+    Objects of Gymnasium, and a `VecEnv` of Stable-Baselines3, count.
+    """
     return isinstance(env, (gymnasium.Env, VectorEnv, loaded(f"{VEC_ENV}.VecEnv")))
 
 
 def runs_processes(layer: Any) -> bool:
-    """Whether a layer runs its environments in other processes."""
+    """Whether a layer runs its inner environments in other processes."""
     return isinstance(layer, (AsyncVectorEnv, loaded(f"{VEC_ENV}.SubprocVecEnv")))
 
 
 def normaliser_flag(layer: Any) -> str:
-    """Return the attribute by which a layer updates its statistics; "" if it has none."""
+    """Return the attribute that switches updates of a layer's statistics on and off.
+
+    The result is "" if the layer does not normalise observations or rewards by statistics.
+    """
     if isinstance(layer, loaded(f"{VEC_ENV}.VecNormalize")):
         return "training"
     # The wrappers of Gymnasium that normalise, of one environment or of many.
@@ -67,7 +79,7 @@ def normaliser_flag(layer: Any) -> str:
 
 
 def inner_environments(env: Any) -> list[Any]:
-    """Return the environments directly within an environment; none from other processes."""
+    """Return the environments directly within `env`; none that run in other processes."""
     inner: list[Any] = []
     for name in INNER:
         value = vars(env).get(name)
@@ -77,7 +89,7 @@ def inner_environments(env: Any) -> list[Any]:
 
 
 def layers(env: Any) -> Iterator[Any]:
-    """Yield an environment and all environments within it, the outermost first.
+    """Yield the environment `env` and all environments within it, the outermost first.
 
     Environments in other processes are not included.
     """
@@ -87,7 +99,9 @@ def layers(env: Any) -> Iterator[Any]:
 
 
 def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
-    """Return the plants in an environment, also those in other processes, in their order.
+    """Return a description of the plants in an environment, in the order of the plants.
+
+    Plants in other processes are included.
 
     Parameters
     ----------
@@ -99,8 +113,8 @@ def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
     Returns
     -------
     list of PlantGroup
-        The list is empty if `env` holds no plants of this package in NumPy, or if its processes
-        are closed.
+        One element for each environment or batch of plants. The list is empty if `env` holds no
+        plants of this package in NumPy, or if the processes of `env` are closed.
     """
     wrappers = outer
     if _changes_policy(env):
@@ -120,7 +134,7 @@ def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
 
 
 def _changes_policy(layer: Any) -> bool:
-    """Whether a layer is a wrapper that may change the observations or the actions."""
+    """Whether a layer is a wrapper that may change observations or actions of a policy."""
     of_rewards = gymnasium.RewardWrapper, gymnasium.vector.VectorRewardWrapper
     if type(layer).__name__ in _NEUTRAL or isinstance(layer, of_rewards):
         return False
@@ -131,17 +145,29 @@ def _changes_policy(layer: Any) -> bool:
 
 
 def ask_processes(env: Any, method: str, *arguments: Any) -> list[Any]:
-    """Return what a method of each environment in other processes returns.
+    """Return what a method returns for each environment in other processes.
 
-    A method that an environment does not have, or whose result cannot be pickled, ends the
-    process of the environment.
+    If an environment lacks the method, or if a result cannot be pickled, the process of this
+    environment ends.
+
+    Parameters
+    ----------
+    env
+        An `AsyncVectorEnv` of Gymnasium or a `SubprocVecEnv` of Stable-Baselines3.
+    method
+        Name of the method to call.
+    *arguments
+        Arguments of the method.
     """
     ask = getattr(env, "env_method", None) or env.call
     return list(ask(method, *arguments))
 
 
 def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
-    """Return the plants in other processes: see `plant_groups`."""
+    """Return the plants in other processes, as `plant_groups` does; [] if these are closed.
+
+    `env` runs the processes, and `outer` holds the names of the wrappers around `env`.
+    """
     try:
         texts = ask_processes(env, "__str__")
         if not all(ask_processes(env, "has_wrapper_attr", "parameters")):

@@ -1,4 +1,4 @@
-"""Make environments from ids and specs: one, or many in one batch."""
+"""Make environments from ids and specs (`EnvSpec`): one environment, or many in one batch."""
 
 from __future__ import annotations
 
@@ -18,9 +18,19 @@ Env = gymnasium.Env[Any, Any]
 
 
 def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
-    """Make an environment from an id or a spec, and from further arguments for it.
+    """Return the environment that an id or an `EnvSpec` stands for.
 
-    A ValueError is raised if the environment cannot be found or an argument is out of range.
+    Parameters
+    ----------
+    env
+        An id such as "MiddlePoint-v0", or an `EnvSpec`.
+    arguments
+        Further arguments of `gymnasium.make`, by name.
+
+    Raises
+    ------
+    ValueError
+        If the environment cannot be found, or an argument is out of range.
     """
     try:
         return gymnasium.make(env, **{"disable_env_checker": True, **arguments})
@@ -32,7 +42,7 @@ def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
 
 
 def make_batch(single: Env, n: int, **modes: Any) -> Any:
-    """Return n environments like `single` in one batch.
+    """Return n environments like `single` in one vector environment.
 
     Parameters
     ----------
@@ -41,13 +51,13 @@ def make_batch(single: Env, n: int, **modes: Any) -> Any:
     n
         Number of environments.
     **modes
-        The `render_mode` and the `autoreset_mode` of the batch.
+        The `render_mode` and the `autoreset_mode` of the vector environment.
 
     Returns
     -------
     VectorEnv or None
-        None if `single` is not of this package, or is in a wrapper other than
-        `IncrementalAction`.
+        None if `single` is not a `MiddlePointEnv`, or is in a wrapper other than
+        `IncrementalAction` and the wrappers of `gymnasium.make`.
     """
     spec, plant = single.spec, single.unwrapped
     if spec is None or type(plant) is not MiddlePointEnv:

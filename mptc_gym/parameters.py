@@ -16,12 +16,12 @@ import numpy as np
 from mptc_gym import checks
 from mptc_gym.checks import Number, reject
 
-Value = TypeVar("Value")  # of a plant number: a float, an array for many plants, or a `Number`
+Value = TypeVar("Value")  # type of a `PlantNumbers` field: float, array, tensor or `Number`
 _LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
 
 class Argument(NamedTuple):
-    """Declaration of an argument of the environment, without the argument's name and type."""
+    """Declaration of one argument of the environment, without the argument's name and type."""
 
     default: Any
     check: checks.Check  # returns a valid value in plain Python types, or raises a ValueError
@@ -30,7 +30,20 @@ class Argument(NamedTuple):
 
 
 def _arg(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
-    """Declare an argument: a dataclass field that carries an `Argument`."""
+    """Return a dataclass field whose metadata hold an `Argument` under the key "argument".
+
+    Parameters
+    ----------
+    default
+        Value of the argument if the caller passes none.
+    check
+        Function of an argument's name and value that returns the valid value in plain Python
+        types, or raises a ValueError.
+    unit
+        Unit for the table of arguments, "" for none.
+    meaning
+        Meaning for the table of arguments.
+    """
     return field(
         default=default, metadata={"argument": Argument(default, check, unit, meaning)}
     )
@@ -38,14 +51,15 @@ def _arg(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class PlantNumbers(Generic[Value]):
-    """The numbers of a plant that can differ from episode to episode.
+    """The arguments of a plant that can differ from episode to episode, such as the delay.
 
-    As arguments, the numbers are of type `Number`: a number, or a range from which each reset
-    draws.
-    During an episode, the numbers are floats for one plant, and arrays for many plants.
+    As arguments of the environment, the fields are of type `Number`: one number, or a range
+    [low, high] from which each reset of the environment draws one number. During an episode,
+    the fields are floats for one plant, and arrays or tensors for many plants.
 
-    Field i takes the i-th random number of a reset. So the order of the fields never changes,
-    and a new field comes last: otherwise a seed would stand for another plant.
+    At each reset, the plant draws a list of random numbers, and field i takes element i of this
+    list. The order of the fields therefore never changes, and a new field comes last: otherwise
+    a seed would stand for another plant.
     """
 
     delay: Value = _arg(18, checks.samples, "samples", "transport delay d of (28)")
@@ -83,12 +97,15 @@ class PlantNumbers(Generic[Value]):
     )
 
     def chosen(self, names: Iterable[str]) -> dict[str, Value]:
-        """Return the plant numbers with these names, by name."""
+        """Return the values of the fields with the names `names`, as a dict by name."""
         return {name: getattr(self, name) for name in names}
 
 
 def slowest_pole(a: Sequence[float]) -> complex:
-    """Return the pole of 1 / A with the largest magnitude, or 0 if there is no pole."""
+    """Return the pole of 1 / A(z^-1) with the largest magnitude, or 0 if A has degree 0.
+
+    `a` holds the coefficients of the polynomial A of equation (28) of the paper, from z^0 on.
+    """
     poles = np.roots([*a, 0.0])
     return complex(poles[np.argmax(np.abs(poles))])
 
@@ -97,8 +114,10 @@ def slowest_pole(a: Sequence[float]) -> complex:
 class Parameters(PlantNumbers[Number]):
     """The arguments of `MiddlePoint-v0`, checked and converted to plain Python types.
 
-    The defaults are the first case of the paper (Section 5, Fig. 5). All quantities are
-    deviations from the operating point. An asterisk marks an argument that can also be a range
+    In the table, (28) is the paper's equation of the plant, and (29) that of the actuator; see
+    `MiddlePointEnv` for both equations and for the paper. The defaults are the first case of
+    the paper (Section 5, Fig. 5). All temperatures and flows are deviations from the operating
+    point. An asterisk marks an argument that can also be a range
     [low, high], from which each `reset` draws a number.
 
     <arguments>
@@ -110,8 +129,9 @@ class Parameters(PlantNumbers[Number]):
         allowed.
     """
 
-    # The plant, (28): A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k). With an unstable A, y
-    # may grow beyond all floats.
+    # The plant, equation (28) of the paper, with temperature y, applied flow u_a, delay d and
+    # white noise xi: A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k). With an unstable A, the
+    # temperature y may grow beyond all floats.
     a: Sequence[float] = _arg(
         (1.0, -0.45181, -0.47546), checks.polynomial, "1", "A in (28), from z^0; begins with 1"
     )
@@ -125,7 +145,7 @@ class Parameters(PlantNumbers[Number]):
         1200, checks.duration, "samples", "duration of the drifts of gain and time constant"
     )
     sampling_interval: float = _arg(8.0, checks.positive, "s", "scale of the time axis only")
-    # The paper plots the set point, but does not state the values.
+    # The paper plots the set point, but does not state the set point's amplitude and period.
     setpoint: str | float | Sequence[float] = _arg(
         "square",
         checks.setpoint,
@@ -146,8 +166,8 @@ class Parameters(PlantNumbers[Number]):
         'P: "square" repeats every P samples; "random" holds a level for P/6 to P/2 samples, '
         "uniformly",
     )
-    # The default observation is the six inputs of the paper's network: y_d(k), y_d(k-1),
-    # y_d(k-2), e(k), e(k-1), e(k-2).
+    # The default observation is the six inputs of the paper's network: the set points y_d(k),
+    # y_d(k-1), y_d(k-2) and the errors e(k), e(k-1), e(k-2).
     setpoint_window: int = _arg(
         3, checks.samples, "samples", "number of latest set points observed"
     )
@@ -200,12 +220,19 @@ class Parameters(PlantNumbers[Number]):
 
     @classmethod
     def of_environment(cls, arguments: Mapping[str, Any]) -> Parameters:
-        """Return the parameters that an environment's keyword arguments stand for.
+        """Return the `Parameters` for the keyword arguments of an environment.
+
+        Parameters
+        ----------
+        arguments
+            Values of arguments of `Parameters`, by name; an argument that is missing has its
+            default.
 
         Raises
         ------
         TypeError
-            If an argument is unknown. The message suggests a similar name, if there is one.
+            If the name of an argument is unknown. The message suggests a similar name, if there
+            is one.
         ValueError
             If an argument is out of range.
         """
@@ -222,7 +249,11 @@ class Parameters(PlantNumbers[Number]):
         return cls(**arguments)
 
     def _check_actuator(self) -> None:
-        """Refuse ranges of limits and dead zones from which a draw would not fit together."""
+        """Raise a ValueError if draws of limits and dead zone could leave no command an effect.
+
+        For all numbers that a reset may draw, `u_min` must be below `u_max`, and the dead zone
+        must not exceed the larger magnitude of the two limits.
+        """
         lowest_u_min, highest_u_min = self.range_of("u_min")
         lowest_u_max, highest_u_max = self.range_of("u_max")
         if highest_u_min >= lowest_u_max:
@@ -237,7 +268,11 @@ class Parameters(PlantNumbers[Number]):
             reject("dead_zone", self.dead_zone, f"{allowed} = {reach:g}")
 
     def _check_time_constant(self) -> None:
-        """Refuse another time constant if A has none, or where the pole would be below 0."""
+        """Raise a ValueError if the time constant of the plant cannot be changed as requested.
+
+        The slowest pole of the polynomial A of equation (28) of the paper must lie between 0
+        and 1, and must not become negative by any factor or drift of the time constant.
+        """
         names = "time_constant_factor", "time_constant_drift"
         pole = slowest_pole(self.a)
         rate = 1.0 - pole.real  # 1 / time constant, per sample
@@ -251,7 +286,10 @@ class Parameters(PlantNumbers[Number]):
             reject(", ".join(names), tuple(self.chosen(names).values()), allowed)
 
     def range_of(self, name: str) -> tuple[float, float]:
-        """Return the lowest and the highest value that a plant number can take."""
+        """Return the lowest and the highest value of the field `name` of `PlantNumbers`.
+
+        Both values are equal if the field is one number instead of a range.
+        """
         value = getattr(self, name)
         if isinstance(value, tuple):
             low, high = value
@@ -260,42 +298,42 @@ class Parameters(PlantNumbers[Number]):
 
     @cached_property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """The ends (low, high) of the plant numbers that each reset draws, by name."""
+        """The ends (low, high) of each field of `PlantNumbers` that is a range, by name."""
         numbers = self.chosen(PLANT_NUMBERS)
         return {name: value for name, value in numbers.items() if isinstance(value, tuple)}
 
     @cached_property
     def lowest(self) -> PlantNumbers[float]:
-        """All plant numbers, with the low end in place of a range."""
+        """All fields of `PlantNumbers`, each range replaced by the range's low end."""
         return PlantNumbers(**{name: self.range_of(name)[0] for name in PLANT_NUMBERS})
 
     @cached_property
     def is_disturbed(self) -> bool:
-        """Whether there is a load disturbance."""
+        """Whether the plant can have a load disturbance other than 0."""
         return self._can_differ(0.0, *_LOAD_ARGUMENTS)
 
     def _can_differ(self, value: float, *names: str) -> bool:
-        """Return whether any of these plant numbers can have another value than `value`."""
+        """Return whether any field of `PlantNumbers` in `names` can be other than `value`."""
         return any(self.range_of(name) != (value, value) for name in names)
 
     @cached_property
     def drifts(self) -> bool:
-        """Whether the dynamics change within an episode."""
+        """Whether gain or time constant of the plant change within an episode."""
         return self._can_differ(1.0, "gain_drift", "time_constant_drift")
 
     @cached_property
     def changes_time_constant(self) -> bool:
-        """Whether the time constant can differ from that of A, at the start or by drift."""
+        """Whether the time constant can differ from that of `a`, at the start or by drift."""
         return self._can_differ(1.0, "time_constant_factor", "time_constant_drift")
 
     @cached_property
     def changes_dynamics(self) -> bool:
-        """Whether A and B of (28) can change, at the start or by drift."""
+        """Whether gain or time constant can differ from those of `a` and `b`, or can drift."""
         return self.drifts or self._can_differ(1.0, "gain_factor", "time_constant_factor")
 
     @cached_property
     def windows(self) -> tuple[int, int, int, int]:
-        """Sizes of the observation's blocks: set points, errors, outputs, actions."""
+        """How many set points, errors, outputs and past actions an observation holds."""
         return self.setpoint_window, self.error_window, self.output_window, self.action_window
 
 
@@ -304,12 +342,18 @@ ARGUMENTS: Final[dict[str, Argument]] = {
 }
 """The declaration of every argument, by name."""
 
+# By name, the index of each field of `PlantNumbers`: at a reset, the field takes the random
+# number with this index, if the field is a range.
 PLANT_NUMBERS: Final = {number.name: i for i, number in enumerate(fields(PlantNumbers))}
 """The index of the random number that a plant number takes at a reset, by name."""
 
 
 def argument_table() -> str:
-    """Return a Markdown table of all arguments except `render_mode`."""
+    """Return a Markdown table with a row for each argument except `render_mode`.
+
+    The columns are name, default, unit and meaning. An asterisk after the default marks an
+    argument that can be a range.
+    """
     rows = ["| Argument | Default | Unit | Meaning |", "|---|---|---|---|"]
     for name, argument in ARGUMENTS.items():
         default = repr(argument.default).replace("'", '"')
@@ -320,9 +364,9 @@ def argument_table() -> str:
 
 
 def insert_table(docstring: str | None) -> str:
-    """Return a docstring with the table of arguments in place of `<arguments>`.
+    """Return a docstring with the table of arguments in place of the text `<arguments>`.
 
-    `python -OO` removes docstrings: then `docstring` is None, and the result is empty.
+    `python -OO` removes docstrings: `docstring` is then None, and the result is "".
     """
     return inspect.cleandoc(docstring or "").replace("<arguments>", argument_table())
 
@@ -331,9 +375,10 @@ Parameters.__doc__ = insert_table(Parameters.__doc__)
 
 
 def spelt_out(function: Callable[..., Any]) -> inspect.Signature:
-    """Return the signature of a constructor, for help() and editors.
+    """Return the signature of a constructor that ends in `**arguments`, for help() and editors.
 
-    In this signature, all arguments of the environment take the place of `**arguments`.
+    In the signature, all arguments of `Parameters` take the place of `**arguments`, and `self`
+    is left out. `function` is the `__init__` of an environment.
     """
     _, *parameters, _ = inspect.signature(function).parameters.values()  # not self, **arguments
     for parameter in inspect.signature(Parameters).parameters.values():

@@ -1,8 +1,15 @@
 """Step the plant and its actuator: arithmetic on state, input and parameters, nothing else.
 
-There are two implementations, side by side: `Plant` in plain floats, which is fastest for one
-plant, and `PlantBatch` in arrays. Both do the same operations in the same order, so their
-results are equal bit for bit.
+There are two implementations: `Plant` in Python floats, which is fastest for one plant, and
+`PlantBatch` in NumPy arrays for many plants. Both classes do the same operations in the same
+order, so the results of both classes are equal bit for bit.
+
+Equations (28) and (29) of the paper (see `MiddlePointEnv`) are the plant and the actuator::
+
+    (28)  A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k)
+    (29)  u_a = 0 where |u| < dead_zone, otherwise u limited to [u_min, u_max]
+
+with temperature y, commanded flow u, applied flow u_a, delay d in samples and white noise xi.
 """
 
 from collections import deque
@@ -15,37 +22,66 @@ from numpy.typing import NDArray
 
 from mptc_gym.parameters import Parameters, PlantNumbers, slowest_pole
 
-Values = NDArray[np.float64]  # one per plant, shape (n,)
-DRIFT_INTERVAL: Final = 10  # samples between changes of drifting dynamics
-FACTORS: Final = "gain_factor", "time_constant_factor"
+Values = NDArray[np.float64]  # one element per plant, shape (n,)
+# Samples between two changes of drifting dynamics: drifts are slow, and a change takes time.
+DRIFT_INTERVAL: Final = 10
+FACTORS: Final = "gain_factor", "time_constant_factor"  # keys of the drift factors in infos
 
 
 def action_from_command(command: Any, u_min: Any, u_max: Any) -> Any:
-    """Scale a command (t/h) to a normalised action in float64: -1 at `u_min`, 1 at `u_max`."""
+    """Return the normalised action, -1 at `u_min` and 1 at `u_max`, for a flow command in t/h.
+
+    The arguments are floats, or arrays or tensors that broadcast, and so is the result.
+    Commands beyond the limits give actions beyond -1 or 1.
+    """
     return 2.0 * (command - u_min) / (u_max - u_min) - 1.0
 
 
 def least_effective(dead_zone: Any, u_min: Any, u_max: Any, rounding: float = 2.0**-50) -> Any:
-    """Return the smallest magnitude of a command that passes the dead zone, t/h.
+    """Return the smallest magnitude of a flow command that passes the dead zone, in t/h.
 
-    A command on the edge of the dead zone passes. Scaled to an action and back, the command may
-    shrink by a few roundings, each of at most 2^-53 of the rounded number, and must still pass.
-    `rounding` bounds the sum of these roundings, as a share of the largest numbers involved.
+    The result lies a few roundings below `dead_zone`: a command on the edge of the dead zone
+    has an effect, also after the command was scaled to an action and back.
+
+    Parameters
+    ----------
+    dead_zone
+        Half width of the dead zone, t/h: a float, an array or a tensor.
+    u_min, u_max
+        Limits of the actuator, t/h.
+    rounding
+        Bound of the accumulated rounding error, as a share of the sum of range and limits. The
+        default, 2^-50, covers 8 roundings of 2^-53 in float64.
     """
     return dead_zone - rounding * (u_max - u_min + abs(u_max) + abs(u_min))
 
 
 def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
-    """Scale commands (t/h) to the float32 actions that an agent passes to the environment.
+    """Return the float32 actions that make the environment apply flow commands in t/h.
 
     Rounding to float32 can move a command from the edge of the dead zone into the dead zone:
-    float32(0.7) stands for 6.99999988 t/h. Such an action is moved outwards by the float32
-    spacing near 1. The arguments broadcast, and the actions have the shape of the result.
+    float32(0.7) stands for 6.99999988 t/h. An action that has lost its effect by rounding is
+    moved away from the dead zone, by the spacing of float32 numbers near 1.
+
+    Parameters
+    ----------
+    command
+        Flows to be commanded, t/h, of any shape.
+    u_min, u_max
+        Limits of the actuator, t/h.
+    dead_zone
+        Half width of the dead zone, t/h.
+
+    Returns
+    -------
+    ndarray of float32
+        Normalised actions, of the shape to which the four arguments broadcast.
     """
     commands = np.asarray(command, float)
     actions = np.asarray(action_from_command(commands, u_min, u_max)).astype(np.float32)
     half_range = (u_max - u_min) / 2.0
-    rounded = (actions.astype(float) + 1.0) * half_range + u_min  # as the plant does
+    # The commands that the plant computes from the rounded actions, t/h.
+    rounded = (actions.astype(float) + 1.0) * half_range + u_min
     lost_its_effect = (np.abs(commands) >= dead_zone) & ~(np.abs(rounded) >= dead_zone)
     spacing = np.spacing(np.maximum(np.abs(actions), np.float32(1.0)))
     outwards = actions + np.copysign(spacing, commands).astype(np.float32)
@@ -53,20 +89,28 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 
 
 class Dynamics:
-    """A and B of (28) as functions of the steady-state gain and the dominant time constant.
+    """The coefficients of the plant as functions of steady-state gain and time constant.
 
-    Gain and time constant are given as factors: g times the gain B(1) / A(1) of the paper's
-    coefficients, and t times their time constant 1 / (1 - p), where p is the slowest pole and
-    A = (1 - p z^-1) Q. The time constant is the area above the step response of
-    1 / (1 - p z^-1), scaled to end at 1. For t times the time constant, 1 - p is divided by t,
-    and Q stays. As this also divides A(1) = (1 - p) Q(1) by t, B is multiplied by g / t.
+    The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k),
+    with temperature y, applied flow u_a, delay d and white noise xi. The polynomial A is (1 - p
+    z^-1) Q, where p is the slowest pole. Two factors, g and t, change the plant: the
+    steady-state gain is g B(1) / A(1), and the time constant is t / (1 - p) samples. The time
+    constant is the area above the step response of 1 / (1 - p z^-1), scaled to end at 1. For t
+    times the time constant, the number 1 - p is divided by t, and the polynomial Q stays. As
+    A(1) = (1 - p) Q(1) is also divided by t, the polynomial B is multiplied by g / t.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the plant, which hold the coefficients of A and B.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._drift_samples = parameters.drift_samples
         self._alpha = tuple(-coefficient for coefficient in parameters.a[1:])
         self._sum_of_a = sum(parameters.a)  # A(1)
-        self._quotient: tuple[float, ...] | None = None  # Q, if the time constant changes
+        # The coefficients of Q from z^0 on, and a 0; None if the time constant never changes.
+        self._quotient: tuple[float, ...] | None = None
         if parameters.changes_time_constant:
             pole = slowest_pole(parameters.a).real  # a real one, as Parameters has checked
             self._rate = 1.0 - pole
@@ -77,12 +121,31 @@ class Dynamics:
             self._quotient = (*quotient, 0.0)
 
     def share(self, age: Any) -> Any:
-        """Return which share of the drifts is complete at k = `age`, from 0 to 1."""
+        """Return the share of gain and time constant drift that is complete at k = `age`.
+
+        The share grows linearly from 0 at sample k = 0 to 1 at sample k = `drift_samples`, and
+        stays 1 from this sample on. `age` is a number, or an array or a tensor with an element
+        for each plant.
+        """
         share = age / self._drift_samples
         return share * (share < 1.0) + (share >= 1.0)  # at most 1, for arrays of any library
 
     def factors(self, numbers: PlantNumbers[Any], age: Any) -> tuple[Any, Any]:
-        """Return g and t at k = `age`: floats, or arrays or tensors for many plants."""
+        """Return the gain factor g and the time constant factor t at sample k = `age`.
+
+        Parameters
+        ----------
+        numbers
+            The plant numbers, which hold the factors at k = 0 and the drifts.
+        age
+            Samples since the start of the episode: a number, or one element for each plant.
+
+        Returns
+        -------
+        tuple
+            g and t, as multiples of the gain and the time constant of A and B of equation (28)
+            of the paper: two floats, or two arrays or tensors of shape (n,) for n plants.
+        """
         share = self.share(age)
         gain = numbers.gain_factor
         time_constant = numbers.time_constant_factor
@@ -92,21 +155,29 @@ class Dynamics:
         )
 
     def coefficients(self, gain: Any, time_constant: Any) -> tuple[list[Any], Any, Any]:
-        """Return the coefficients of (28) for g = `gain` and t = `time_constant`.
+        """Return the coefficients of the plant, equation (28) of the paper, for given factors.
+
+        Parameters
+        ----------
+        gain, time_constant
+            g and t, as multiples of the gain and the time constant of the polynomials A and B:
+            floats, or arrays or tensors of shape (n,) for n plants.
 
         Returns
         -------
         alpha : list
-            Factors of y(k-1), y(k-2), ...: the coefficients of A from z^-1 on, negated.
+            Factors of the outputs y(k-1), y(k-2), ...: the coefficients of A from z^-1 on,
+            negated.
         scale : float or array
-            Factor g / t of B.
+            Factor g / t of the polynomial B.
         load_gain : float or array
-            Factor A(1) of the load w(k).
+            A(1) after the change of the time constant: the factor of the load w(k), by which a
+            constant load w adds w to the steady-state temperature.
         """
         alpha: list[Any] = list(self._alpha)
         if self._quotient is not None:
             pole = 1.0 - self._rate / time_constant
-            # -(1 - p z^-1) Q, from z^-1 on.
+            # The coefficients of -(1 - p z^-1) Q, with p = `pole`, from z^-1 on.
             alpha = [
                 pole * previous - following for previous, following in pairwise(self._quotient)
             ]
@@ -114,17 +185,26 @@ class Dynamics:
 
 
 class Plant:
-    """Command scaling, actuator (29) and middle-point temperature (28), initially at rest.
+    """One plant with its actuator, initially at rest: equations (28) and (29) of the paper.
 
-    As printed, (29) compares the magnitude of u with U_min in one of the cases. The intended
-    meaning is: a command inside the dead zone has no effect, and any other command, also a
-    command on the edge of the dead zone, is limited to [U_min, U_max].
+    As printed in the paper, equation (29) compares the magnitude of the command u with U_min in
+    one of its cases. The intended meaning is: a command inside the dead zone has no effect, and
+    any other command, also a command on the edge of the dead zone, is limited to [U_min,
+    U_max].
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment.
+    numbers
+        The plant numbers of the episode, in place of the ranges in `parameters`.
 
     Attributes
     ----------
     factors : dict of float
-        If gain and time constant drift, their present values under the names `FACTORS`, as
-        multiples of the gain and the time constant of A and B. Otherwise empty.
+        If gain and time constant drift, the present gain factor and time constant factor, under
+        the names `FACTORS`, as multiples of the gain and the time constant of the polynomials A
+        and B. Empty if neither drifts.
     """
 
     def __init__(self, parameters: Parameters, numbers: PlantNumbers[float]) -> None:
@@ -137,27 +217,40 @@ class Plant:
         self._age = 0
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()
-        # A coefficient is paired with the index of its sample in the history. Both histories
-        # have the newest sample first: y(k), y(k-1), ... and u_a(k), u_a(k-1), ...
+        # A coefficient of B is paired with the index of its flow in `_inputs`. The histories of
+        # temperatures y and flows u_a have the newest sample first: y(k), y(k-1), ... and
+        # u_a(k), u_a(k-1), ...
         delay = int(numbers.delay)
         self._beta = tuple(enumerate(parameters.b, start=delay))
         self._outputs = deque([0.0] * len(self._alpha), len(self._alpha))
         self._inputs = deque([0.0] * (delay + len(self._beta)), delay + len(self._beta))
 
     def step(self, action: float, noise: float, load: float) -> tuple[float, float, float]:
-        """Move from sample k to k+1.
+        """Move the plant from sample k to sample k+1.
 
-        The arguments are a(k), and n(k+1) and the load w(k+1), degC. The results are u(k) and
-        u_a(k), t/h, and y(k+1), degC.
+        Parameters
+        ----------
+        action
+            Normalised action a(k): -1 commands `u_min`, and 1 commands `u_max`.
+        noise
+            Coloured noise n(k+1) of equation (28) of the paper, degC.
+        load
+            Load disturbance w(k+1), degC.
+
+        Returns
+        -------
+        tuple of float
+            Commanded flow u(k) and applied flow u_a(k), t/h, and temperature y(k+1), degC.
         """
         if self._drifts:
             self._age += 1
             if self._age % DRIFT_INTERVAL == 0:
                 self._update_dynamics()
         edge, u_min, u_max, half_range = self._actuator
-        # Section 4, last formula, for actions from -1 to 1 in place of outputs from 0 to 1.
+        # Last formula of the paper's Section 4, which scales network outputs from 0 to 1, for
+        # actions from -1 to 1.
         command = u_min + (action + 1.0) * half_range
-        # (29)
+        # Equation (29): dead zone and limits.
         applied = command
         if -edge < command < edge:
             applied = 0.0
@@ -165,7 +258,7 @@ class Plant:
             applied = u_min
         elif command > u_max:
             applied = u_max
-        # (28): the response to the inputs by B, the load, and the past outputs by A.
+        # Equation (28): the sum of B times past flows, the load, and A times past temperatures.
         inputs = self._inputs
         inputs.appendleft(applied)
         response = 0.0
@@ -181,7 +274,7 @@ class Plant:
         return command, applied, output
 
     def _update_dynamics(self) -> None:
-        """Update the dynamics to the plant's age."""
+        """Compute coefficients and drift factors for the present sample k of the episode."""
         factors = self._dynamics.factors(self._numbers, self._age)
         if self._drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
@@ -190,22 +283,30 @@ class Plant:
 
 
 class PlantBatch:
-    """Many plants side by side: `Plant` in arrays.
+    """Many plants with their actuators, in NumPy arrays; the results equal those of `Plant`.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment.
+    num_envs
+        Number n of plants.
 
     Attributes
     ----------
     numbers : PlantNumbers
-        The numbers of the present plants, in arrays of float64. Numbers that are drawn have the
-        shape (n,), and the others the shape ().
+        The plant numbers of the present episodes, in arrays of float64. Numbers that resets
+        draw have the shape (n,), and the other numbers the shape ().
     factors : dict of ndarray of float64
-        If gain and time constant drift, their present values under the names `FACTORS`, shape
-        (n,), as multiples of the gain and the time constant of A and B. Otherwise empty.
+        If gain and time constant drift, the present gain factor and time constant factor, under
+        the names `FACTORS`, shape (n,), as multiples of the gain and the time constant of the
+        polynomials A and B of equation (28) of the paper. Empty if neither drifts.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         self._parameters = parameters
         self._num_envs = num_envs
-        # In array arithmetic, an array of one number is faster than a number.
+        # In NumPy arithmetic, an array of one element is faster than a Python number.
         numbers: dict[str, Values] = {}
         for name, lowest in vars(parameters.lowest).items():
             shape = (num_envs,) if name in parameters.ranges else ()
@@ -217,7 +318,7 @@ class PlantBatch:
         # Samples since the plants were created, and at the start of each plant's episode.
         self._clock = 0
         self._starts = np.zeros(num_envs if parameters.drifts else (), np.int64)
-        self._next_update = 0  # the clock when the dynamics change next
+        self._next_update = 0  # the clock when the dynamics of some plant change next
         self.factors: dict[str, Values] = {}
         self._update_dynamics()
         order = len(self._alpha)
@@ -225,15 +326,15 @@ class PlantBatch:
         self._input_response = _InputResponse(parameters, num_envs)
 
     def reset(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
-        """Bring some plants to rest.
+        """Bring some plants to rest and replace their plant numbers.
 
         Parameters
         ----------
         which
             The indices of the plants.
         numbers
-            The new numbers of these plants: numbers that are drawn have the shape
-            (len(which),), and the others the shape ().
+            The new plant numbers: numbers that resets draw have the shape (len(which),), and
+            the other numbers the shape ().
         """
         for outputs in self._outputs:
             outputs[which] = 0.0
@@ -251,10 +352,22 @@ class PlantBatch:
     def step(
         self, action: Values, noise: Values, load: Values | None = None
     ) -> tuple[Values, Values, Values]:
-        """Move all plants from sample k to k+1, like `Plant.step`, in arrays of shape (n,).
+        """Move all plants from sample k to sample k+1. All arrays have the shape (n,).
 
-        Without a load, `load` is None. The plants keep the array of outputs that they return,
-        so the caller must not modify this array.
+        Parameters
+        ----------
+        action
+            Normalised actions a(k).
+        noise
+            Coloured noise n(k+1) of equation (28) of the paper, degC.
+        load
+            Load disturbance w(k+1), degC; None if the plants have no load disturbance.
+
+        Returns
+        -------
+        tuple of ndarray
+            Commanded flows u(k) and applied flows u_a(k), t/h, and temperatures y(k+1), degC.
+            The caller must not modify the array of temperatures, which the plants keep.
         """
         if self._parameters.drifts:
             self._clock += 1
@@ -264,14 +377,14 @@ class PlantBatch:
         command = action + one
         command *= half_range
         command += lowest
-        # (29)
+        # Equation (29): limits and dead zone.
         applied = np.minimum(command, u_max)
         np.maximum(applied, u_min, out=applied)
         # A product is faster than a mask, whose branches are unpredictable. The product can be
         # -0, which adding 0 turns into 0.
         applied *= np.abs(command) >= edge
         applied += zero
-        # (28): the response to the inputs by B, the load, and the past outputs by A.
+        # Equation (28): the sum of B times past flows, the load, and A times past temperatures.
         response = self._input_response.add(applied)
         if self._parameters.changes_dynamics:
             response = self._scale * response
@@ -284,10 +397,10 @@ class PlantBatch:
         return command, applied, output
 
     def _update_actuator(self) -> None:
-        """Compute what a step needs of the actuator's numbers.
+        """Compute the arrays that `step` needs from limits and dead zones, after these change.
 
-        The limits have the shape (num_envs,): in comparisons, an array of full length is faster
-        than an array of one number.
+        The limits are stored with the shape (num_envs,): in comparisons, an array of full
+        length is faster than an array of one number.
         """
         u_min = self.numbers.u_min
         u_max = self.numbers.u_max
@@ -302,7 +415,10 @@ class PlantBatch:
         )
 
     def _update_dynamics(self) -> None:
-        """Update the dynamics to the ages of the plants, in steps of `DRIFT_INTERVAL`."""
+        """Compute coefficients and drift factors for the present sample k of each plant.
+
+        The dynamics of a plant change only at samples that are multiples of `DRIFT_INTERVAL`.
+        """
         ages = self._clock - self._starts
         last_changes = ages // DRIFT_INTERVAL * DRIFT_INTERVAL
         factors = self._dynamics.factors(self.numbers, last_changes)
@@ -315,37 +431,53 @@ class PlantBatch:
 
 
 class _InputResponse:
-    """The response of many plants to their inputs: B of (28), for a block of samples at once.
+    """The part of the temperature that past flows cause, B(z^-1) u_a(k-d), for many plants.
 
-    With d the shortest delay that can be drawn, the inputs of d + 1 samples affect no output
-    before the last of these inputs is known. So the response to such a block is computed when
-    the block is complete, and then read sample by sample.
+    B is the polynomial of equation (28) of the paper, u_a the applied flow and d the delay, in
+    samples. With d the shortest delay that can be drawn, the flows of d + 1 samples affect no
+    temperature before the last of these flows is known. The effect of such a block of d + 1
+    flows is therefore computed when the block is complete, and then read sample by sample.
 
-    The inputs lie in rows, one per sample, the oldest first: the older inputs that B and longer
-    delays also need, and then the block.
+    The flows lie in rows, one row per sample, the oldest sample first: the older flows that B
+    and longer delays also need, and then the flows of the block.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the plants.
+    num_envs
+        Number n of plants.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         self._num_envs = num_envs
         self._beta = tuple(parameters.b)
         shortest, self._longest = map(int, parameters.range_of("delay"))
-        self._block = shortest + 1  # samples
-        self._older = len(self._beta) - 1 + self._longest - shortest  # samples
+        self._block = shortest + 1  # samples in a block
+        # Samples before the block whose flows B and longer delays need.
+        self._older = len(self._beta) - 1 + self._longest - shortest
         self._inputs = np.zeros((self._older + self._block, num_envs))
         self._response = np.zeros((self._block, num_envs))
-        self._place = self._block - 1  # of the next input in the block: the first completes it
-        # If the delays differ: the inputs at the delay of each plant, and the indices of these
-        # inputs in the flattened inputs.
+        # Index of the next flow in the block. The first flow completes a block, whose other
+        # flows, before k = 0, are 0.
+        self._place = self._block - 1
+        # If the delays differ: the flows in `_inputs` that act on the block after the delay of
+        # each plant, and the indices of these flows in the flattened `_inputs`.
         self._delays_differ = self._longest > shortest
         rows = len(self._beta) - 1 + self._block if self._delays_differ else 0
         self._delayed = np.zeros((rows, num_envs))
         self._delayed_at = np.zeros((rows, num_envs), np.intp)
 
     def reset(self, which: NDArray[np.intp], delays: Values) -> None:
-        """Begin an episode of some plants, whose inputs have been 0 so far.
+        """Begin an episode of some plants, whose flows before the episode count as 0.
 
-        `which` are the indices of the plants. `delays`, in samples, have the shape
-        (len(which),) if delays are drawn, otherwise ().
+        Parameters
+        ----------
+        which
+            The indices of the plants.
+        delays
+            Delays of these plants, samples, shape (len(which),) if delays are drawn, otherwise
+            shape ().
         """
         self._inputs[:, which] = 0.0
         self._response[:, which] = 0.0
@@ -355,7 +487,11 @@ class _InputResponse:
             self._delayed_at[:, which] = rows * self._num_envs + which
 
     def add(self, applied: Values) -> Values:
-        """Add u_a(k), t/h, and return the response in y(k+1), degC; only to be read."""
+        """Add the applied flows of sample k and return their effect on the next temperatures.
+
+        `applied` is u_a(k), t/h, shape (n,). The result is B(z^-1) u_a(k+1-d), a part of
+        y(k+1), degC, shape (n,); the caller must not modify the result.
+        """
         self._inputs[self._older + self._place] = applied
         self._place += 1
         if self._place == self._block:
@@ -365,7 +501,7 @@ class _InputResponse:
         return response
 
     def _respond(self) -> None:
-        """Compute the response to a complete block of inputs, and make room for the next."""
+        """Compute the effect of a complete block of flows, and make room for the next block."""
         inputs = self._inputs
         if self._delays_differ:
             inputs = inputs.take(self._delayed_at, out=self._delayed, mode="clip")

@@ -1,4 +1,4 @@
-"""Describe plants to a teacher, by numbers that a policy cannot see."""
+"""Describe plants to a teacher in training, by quantities that a policy cannot observe."""
 
 from __future__ import annotations
 
@@ -11,38 +11,45 @@ from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 
 class PlantState(NamedTuple):
-    """What a teacher may know of n plants at the present sample.
+    """What a teacher, but no policy, may know of n plants at the present sample.
 
-    Each field has the shape (n,). The fields are NumPy arrays of float64, or tensors of the
-    type and on the device of the environment.
+    Each field has the shape (n,). The fields are NumPy arrays of float64, or PyTorch tensors of
+    the type and on the device of the environment.
     """
 
     delay: Any  # samples
     dead_zone: Any  # half width, t/h
     gain: Any  # in the steady state, degC per t/h
-    time_constant: Any  # the dominant time constant, s; NaN if A of (28) has none
+    # The dominant time constant, s; NaN if the plant's slowest pole is not between 0 and 1.
+    time_constant: Any
     load: Any  # w, degC
 
 
 def plant_state(
     parameters: Parameters, numbers: Mapping[str, Any], ages: Any, load: Any
 ) -> PlantState:
-    """Return the state of n plants at the present sample.
+    """Return delay, dead zone, gain, time constant and load of n plants at the present sample.
 
     Parameters
     ----------
     parameters
         The arguments of the plants.
     numbers
-        The numbers that were drawn for the arguments that are ranges, by name, shape (n,).
+        The plant numbers that resets drew for the arguments that are ranges, by name, shape
+        (n,).
     ages
-        The sample k of the episode of each plant, shape (n,).
+        The present sample k of each plant's episode, shape (n,).
     load
-        The load w(k) of each plant, degC, shape (n,).
+        The load disturbance w(k) of each plant, degC, shape (n,).
+
+    Returns
+    -------
+    PlantState
+        Arrays or tensors of shape (n,), of the library and type of `load`.
     """
     nominal = {name: parameters.range_of(name)[0] for name in PLANT_NUMBERS}
     plants: PlantNumbers[Any] = PlantNumbers(**{**nominal, **numbers})
-    # Dynamics that drift change at samples that are multiples of the interval.
+    # Drifting dynamics change only at samples that are multiples of `DRIFT_INTERVAL`.
     changed_at = ages - ages % DRIFT_INTERVAL
     gain_factor, time_constant_factor = Dynamics(parameters).factors(plants, changed_at)
     zeros = load * 0.0
@@ -56,13 +63,21 @@ def plant_state(
 
 
 def _nominal_gain(parameters: Parameters) -> float:
-    """Return B(1) / A(1) of (28), degC per t/h; infinite for an integrating plant."""
+    """Return the steady-state gain B(1) / A(1), degC per t/h; infinite where A(1) is 0.
+
+    A and B are the polynomials of equation (28) of the paper, with the coefficients `a` and `b`
+    of the arguments `parameters`.
+    """
     denominator = sum(parameters.a)
     return sum(parameters.b) / denominator if denominator else math.inf
 
 
 def _nominal_time_constant(parameters: Parameters) -> float:
-    """Return 1 / (1 - p) of the slowest pole p, s; NaN unless p is between 0 and 1."""
+    """Return the time constant 1 / (1 - p) samples of the plant's slowest pole p, in seconds.
+
+    The result is NaN unless p is real and between 0 and 1. The pole p is that of 1 / A, with
+    the coefficients `a` of the arguments `parameters`.
+    """
     pole = slowest_pole(parameters.a)
     if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
         return math.nan

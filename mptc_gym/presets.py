@@ -1,8 +1,9 @@
-"""Define presets of the environment, from the paper's cases to a hard one."""
+"""Define presets of the environment's arguments, from the paper's three cases to a hard one."""
 
 from typing import Any, Final
 
-# A boiler in operation: noise, and a load that steps and drifts.
+# A boiler in operation, with two noises, and a load disturbance that steps and wanders. The
+# variances are in degC^2, the amplitude in degC and the interval in samples.
 _BOILER: Final[dict[str, Any]] = {
     "noise_variance": 0.5,
     "measurement_noise_variance": 0.1,
@@ -11,7 +12,8 @@ _BOILER: Final[dict[str, Any]] = {
     "disturbance_walk_variance": 0.0005,
 }
 
-# Plants that differ from episode to episode.
+# Plants that differ from episode to episode: ranges, in samples (delay), t/h (dead zone), and
+# multiples of the paper's gain and time constant.
 _SPREAD: Final[dict[str, Any]] = {
     "delay": [12, 24],
     "dead_zone": [3.0, 7.0],

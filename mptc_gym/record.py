@@ -1,6 +1,6 @@
-"""Record the latest samples of an episode for a picture.
+"""Record the latest samples of an episode, from which pictures are drawn.
 
-A record holds only numbers, so that it can be copied with its environment.
+A record holds only numbers, so that an environment can be copied together with its record.
 """
 
 from collections import deque
@@ -8,39 +8,49 @@ from typing import NamedTuple
 
 from mptc_gym.parameters import PlantNumbers
 
-SPAN = 200  # fewest samples that a picture spans
-LONGEST = 2000  # most samples that a picture spans, even with a long delay
-FARTHEST = 1e12  # degC; temperatures beyond this value, and NaN, are drawn at the edge
+SPAN = 200  # fewest samples that a picture spans: some 27 minutes of 8 s samples
+LONGEST = 2000  # most samples that a picture spans, even where four delays are longer
+FARTHEST = 1e12  # degC; temperatures beyond +-FARTHEST, and NaN, are drawn at the edge
 
 
 class Sample(NamedTuple):
-    """The signals of sample k, after the step from sample k-1."""
+    """Set point and temperature at sample k, and the flows of the step from sample k-1 to k."""
 
-    setpoint: float  # y_d(k), degC
-    output: float  # y(k), degC
-    command: float  # u(k-1), t/h
-    applied: float  # u_a(k-1), t/h
+    setpoint: float  # set point y_d(k), degC
+    output: float  # true temperature y(k), degC
+    command: float  # commanded flow u(k-1), t/h
+    applied: float  # applied flow u_a(k-1), t/h
 
 
 class Record:
-    """The latest samples of an episode that starts at rest with the set point y_d(0), degC.
+    """The latest samples of an episode, and the axes of a picture of these samples.
+
+    Parameters
+    ----------
+    plant
+        The plant numbers of the episode.
+    sampling_interval
+        Sampling interval, s.
+    setpoint
+        Set point at k = 0, degC. Temperature and flows are 0 at k = 0.
 
     Attributes
     ----------
     plant : PlantNumbers
-        The numbers of the plant in this episode.
+        The plant numbers of the episode, such as delay, dead zone and limits.
     sampling_interval : float
         Sampling interval, s.
     span : int
         Samples between the left and the right edge of a picture.
     flow_axis : tuple of float
-        The ends of the flow axis, t/h: the range of the actuator with a margin.
+        The ends of the flow axis, t/h: the range of the actuator, widened to include 0, with a
+        margin of 12 % at each end.
     samples : deque of Sample
         The latest samples, at most `span` + 1, the newest last.
     k : int
-        The newest sample.
+        The index of the newest sample.
     first : int
-        The sample at the left edge of a picture.
+        The index of the sample at the left edge of a picture.
     """
 
     def __init__(
@@ -56,12 +66,21 @@ class Record:
         self.samples = deque([Sample(setpoint, 0.0, 0.0, 0.0)], maxlen=self.span + 1)
         self.k = 0
         self.first = 0
-        # The extremes of all temperatures of the episode, so that the axis rarely changes.
+        # The extremes of all set points and temperatures of the episode, degC. With the
+        # extremes of the visible samples alone, the axis would change often.
         self._lowest = min(0.0, setpoint)
         self._highest = max(0.0, setpoint)
 
     def add(self, setpoint: float, output: float, command: float, applied: float) -> None:
-        """Add a step: y_d(k+1) and y(k+1), degC, and u(k) and u_a(k), t/h."""
+        """Add the results of the step from sample k to sample k+1.
+
+        Parameters
+        ----------
+        setpoint, output
+            Set point y_d(k+1) and true temperature y(k+1), degC.
+        command, applied
+            Commanded flow u(k) and applied flow u_a(k), t/h.
+        """
         self.k += 1
         self.first = max(0, self.k - self.span)
         self.samples.append(Sample(setpoint, output, command, applied))
@@ -72,6 +91,6 @@ class Record:
 
     @property
     def temperature_axis(self) -> tuple[float, float]:
-        """The ends of the temperature axis, degC, which covers the episode so far."""
+        """The ends of the temperature axis, degC: the episode's extremes with a margin."""
         margin = max(0.05 * (self._highest - self._lowest), 0.5)
         return self._lowest - margin, self._highest + margin

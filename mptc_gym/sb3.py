@@ -37,27 +37,37 @@ from mptc_gym.scoring.opening import opened
 
 __all__ = ["GymnasiumVecEnv", "ScoreCallback", "load", "make_vec_env", "save", "spec_of"]
 
-MEMBER = "mptc_gym.json"  # of a zip
+MEMBER = "mptc_gym.json"  # name of the file that `save` adds to the zip of a model
 
 
 def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any) -> EnvSpec:
     """Return the spec of an id or spec with the windows and wrappers of a model's environments.
 
+    The result is for `evaluate`, as in::
+
         evaluate(model, spec_of(model, "MiddlePointHard-v0"))
 
-    Wrappers of Stable-Baselines3, such as `VecNormalize`, are not in a spec.
+    A spec does not hold wrappers of Stable-Baselines3, such as `VecNormalize`.
 
     Parameters
     ----------
     policy
-        A model of Stable-Baselines3 with its environments.
+        A model of Stable-Baselines3 with the environments of its training.
     env, **arguments
-        An id or a spec, and further arguments for it, as in `gymnasium.make`.
+        An id or an `EnvSpec`, and further arguments for the environment, as in
+        `gymnasium.make`.
+
+    Returns
+    -------
+    EnvSpec
+        The spec of `env`, in which the window sizes of the observation and the wrappers of
+        Gymnasium are those of the model's environments.
 
     Raises
     ------
     ValueError
-        If the model has no environments, or if these cannot be made from their spec.
+        If the model has no environments, or if these environments cannot be made from their
+        spec.
     """
     spec_of_training = _spec(policy)
     windows = plant_groups(policy.get_env())[0].parameters.windows
@@ -68,7 +78,11 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
 
 
 def _spec(model: Any) -> EnvSpec:
-    """Return the spec of the first of a model's environments; ValueError if it makes none."""
+    """Return the spec of the first environment of a model, without the `Monitor` around it.
+
+    A ValueError is raised if the model has no environments, or if `gymnasium.make` cannot make
+    the environment from the spec.
+    """
     spec: Any = None
     try:
         spec = model.get_env().get_attr("spec")[0]
@@ -91,8 +105,15 @@ def _spec(model: Any) -> EnvSpec:
 def save(model: BaseAlgorithm, path: str | Path) -> None:
     """Save a model with the spec of its environments, in a zip that `load` reads.
 
-    The zip is the zip of `model.save` with one more member. It replaces an existing file only
-    when it is complete. `.zip` is added to a name without an ending.
+    The zip is that of the method `model.save`, with one more file inside. An existing file at
+    `path` is replaced only when the new zip is complete.
+
+    Parameters
+    ----------
+    model
+        A model of Stable-Baselines3 with its environments.
+    path
+        Where to write the zip; `.zip` is added to a name without an ending.
 
     Raises
     ------
@@ -113,7 +134,7 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     algorithm = f"{type(model).__module__}:{type(model).__name__}"
     record = json.dumps({"algorithm": algorithm, "spec": spec.to_json()})
     try:
-        # In a new folder, no other program writes to the file.
+        # The folder is new, so no other program writes to the file while it is incomplete.
         with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
             complete = Path(folder, "model.zip")
             model.save(complete)
@@ -135,7 +156,12 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     path
         The zip; `.zip` is added to a name without an ending.
     **arguments
-        Further arguments of the algorithm's `load`, such as `device="cpu"`.
+        Further arguments of the method `load` of the algorithm's class, such as `device="cpu"`.
+
+    Returns
+    -------
+    BaseAlgorithm
+        The model, of the class that was saved, with new environments.
 
     Raises
     ------
@@ -165,7 +191,10 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
 
 
 def _zip_path(path: str | Path) -> Path:
-    """Return the path of a zip, whose ending may be left out, as in Stable-Baselines3."""
+    """Return a path with the ending `.zip`, or the path itself if it has an ending.
+
+    Stable-Baselines3 completes the paths of models by the same rule.
+    """
     path = Path(path)
     return path if path.suffix else path.with_suffix(".zip")
 
@@ -173,34 +202,37 @@ def _zip_path(path: str | Path) -> Path:
 class ScoreCallback(BaseCallback):
     """Score the policy during a training, without exploration, and keep the best policy.
 
-    The episodes are those of `VALIDATION_SEED`, which no published score uses. Where nothing is
-    random, as in `MiddlePoint-v0`, all episodes are the same: score with another set point than
-    that of published scores, such as `setpoint_period=500`. The logger of the model records
-    `score/mean_error`, degC, and, where the package has a bound, `score/score`.
+    The episodes of a score have seeds from `VALIDATION_SEED` of `mptc_gym.evaluation` on, which
+    no published score uses. Where nothing is random, as in `MiddlePoint-v0`, all episodes are
+    the same: choose another set point than that of published scores, such as
+    `setpoint_period=500`. The logger of the model records `score/mean_error`, degC, and, where
+    the package has a bound of the mean error, `score/score`.
 
     Parameters
     ----------
     env, **arguments
-        Where to score, as in `mptc_gym.evaluate`; `env` may also be the environment of the
-        training. An id or a spec takes the windows and wrappers of the training: see `spec_of`.
-        A copy of a `VecNormalize` takes the statistics of the training.
+        The environments of a score, as in `mptc_gym.evaluate`; `env` may also be the
+        environment of the training. If `env` is an id or a spec, the scored environments get
+        the windows and wrappers of the training: see `spec_of`. If `env` is in a
+        `VecNormalize`, the policy acts in a copy of `env` with the statistics of the training.
     every
-        Samples of experience between two scores. The last score is at the end of the training.
+        Samples of experience between two scores, summed over all plants. The last score is at
+        the end of the training.
     episodes
-        Episodes of a score. Where bounds differ by episode, the package has bounds of 200
-        episodes.
+        Number of episodes of a score. Where the least possible error differs from episode to
+        episode, the package has bounds for 200 episodes at most.
     path
-        Zip in which to keep the policy with the least mean error, if any: see `save`. A
-        ValueError is raised if the file exists before the first training.
+        Zip in which to keep the policy with the least mean error: see `save`. None keeps no
+        file. A ValueError is raised if the file exists before the first training.
     verbose
         1 prints each score, 0 does not.
 
     Attributes
     ----------
     scores : list of (int, Evaluation)
-        Samples of experience, and the result at that time, of each score.
+        For each score, the samples of experience at that time, and the result.
     best : Evaluation or None
-        The result with the least mean error.
+        The result with the least mean error; None before the first score.
     """
 
     def __init__(
@@ -224,8 +256,12 @@ class ScoreCallback(BaseCallback):
         self._has_saved = False
 
     def _init_callback(self) -> None:
-        """Refuse, before a training, what would fail at the first score."""
-        self._latest = self.model.num_timesteps  # of the latest score
+        """Raise, before a training, the errors that would come up at the first score.
+
+        Stable-Baselines3 calls this method at the start of each `learn`. A ValueError is raised
+        if `path` exists or cannot be written, or if the environments do not fit the model.
+        """
+        self._latest = self.model.num_timesteps  # samples of experience at the latest score
         if self.path is not None:
             if self.path.exists() and not self._has_saved:
                 allowed = "a file that does not exist yet, as it would be overwritten"
@@ -238,7 +274,10 @@ class ScoreCallback(BaseCallback):
             check_fit(self.model, plants)
 
     def _environment(self) -> tuple[Any, dict[str, Any]]:
-        """Return where to score at present, and further arguments, for `evaluate`."""
+        """Return the environments of a score and further arguments, both for `evaluate`.
+
+        Copies of a `VecNormalize` have the statistics that the training has at present.
+        """
         if isinstance(self._env, str | EnvSpec):
             return spec_of(self.model, self._env, **self._arguments), {}
         if not is_environment(self._env):
@@ -252,11 +291,13 @@ class ScoreCallback(BaseCallback):
         return env, self._arguments
 
     def _on_step(self) -> bool:
+        """Score the policy if `every` samples have passed, and return True to go on."""
         if self.num_timesteps >= self._latest + self.every:
             self._score()
         return True
 
     def _on_training_end(self) -> None:
+        """Score the policy once more, unless there is a score of the present policy."""
         if self.num_timesteps > self._latest:
             self._score()
 
@@ -284,5 +325,5 @@ class ScoreCallback(BaseCallback):
 
 
 def _normalisers(env: Any) -> list[VecNormalize]:
-    """Return the layers of an environment that are a `VecNormalize`, the outermost first."""
+    """Return each `VecNormalize` among the layers of an environment, outermost first."""
     return [layer for layer in layers(env) if isinstance(layer, VecNormalize)]

@@ -1,4 +1,7 @@
-"""Step batches of plants as one `VecEnv` of Stable-Baselines3; see `mptc_gym.sb3`."""
+"""Step batches of plants as one `VecEnv` of Stable-Baselines3; see `mptc_gym.sb3`.
+
+A batch is a vector environment of Gymnasium.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,10 @@ from mptc_gym.wrappers import IncrementalAction
 class GymnasiumVecEnv(VecEnv):
     """Step whole batches at once, where `DummyVecEnv` steps one environment after another.
 
-    All that it returns is bit for bit that of `DummyVecEnv` with the same environments, each in
-    a `Monitor`, except for infos: `step` fills the infos of an environment only where its
-    episode ends, as making all these dicts would take longer than the step. The attribute
-    `infos` holds the infos of all environments in Gymnasium's form, as arrays.
+    All methods return bit for bit what a `DummyVecEnv` returns with the same environments, each
+    in a `Monitor`, except for infos: `step` returns an empty info for an environment whose
+    episode goes on, as making a dict for each environment would take longer than the step. The
+    attribute `infos` holds the infos of all environments in Gymnasium's form, as arrays.
 
     Parameters
     ----------
@@ -34,6 +37,11 @@ class GymnasiumVecEnv(VecEnv):
         The spec of one environment with its wrappers, if all environments are alike.
     group
         Number of neighbouring environments that share a seed, and thus all random numbers.
+
+    Attributes
+    ----------
+    infos : dict
+        The infos of the latest `reset` or `step` by name, in arrays of shape (num_envs,).
     """
 
     def __init__(
@@ -52,25 +60,33 @@ class GymnasiumVecEnv(VecEnv):
             self._slices.append(slice(num_envs, num_envs + batch.num_envs))
             num_envs += batch.num_envs
         self._next_seeds: list[int | None] = [None] * num_envs
-        self._returns = np.zeros(num_envs)  # of the episode so far
-        self._lengths = np.zeros(num_envs, np.int64)  # of the episode so far, samples
+        # Sum of rewards and number of samples of each environment's episode so far.
+        self._returns = np.zeros(num_envs)
+        self._lengths = np.zeros(num_envs, np.int64)
         super().__init__(
             num_envs, batches[0].single_observation_space, batches[0].single_action_space
         )
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seeds of the next reset: environment i has `seed + i // group`."""
+        """Set and return the seeds of the next reset: environment i has `seed + i // group`.
+
+        If `seed` is None, a random seed takes its place.
+        """
         first = cast("int", super().seed(seed)[0])  # a random seed if `seed` is None
         seeds = [first + index // self.group for index in range(self.num_envs)]
         self.set_seeds(seeds)
         return seeds
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
-        """Set the seeds of the next reset, one for each environment."""
+        """Set the seeds of the next reset: one integer for each environment."""
         self._next_seeds = [*seeds]
 
     def reset(self) -> NDArray[Any]:
-        """Reset all environments, with the seeds set by `seed` or `set_seeds`."""
+        """Reset all environments, and return the observations, shape (num_envs, size).
+
+        The seeds are those that `seed` or `set_seeds` has set since the latest reset. Without
+        such seeds, the random numbers continue.
+        """
         returned = [
             batch.reset(seed=self._next_seeds[numbers])
             for batch, numbers in zip(self.batches, self._slices, strict=True)
@@ -87,11 +103,25 @@ class GymnasiumVecEnv(VecEnv):
         return np.concatenate(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions, shape (num_envs, action size)."""
+        """Store the actions for `step_wait`, shape (num_envs, 1)."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step with the stored actions."""
+        """Step all environments with the actions that `step_async` has stored.
+
+        Returns
+        -------
+        observations : ndarray
+            The observations, shape (num_envs, size); where an episode has ended, the first
+            observation of the next episode.
+        rewards : ndarray of float32
+            The rewards, shape (num_envs,).
+        ended : ndarray of bool
+            Whether an episode has ended, shape (num_envs,).
+        infos : list of dict
+            The info of each environment whose episode has ended, with the last observation as
+            "terminal_observation"; an empty dict for each other environment.
+        """
         returned = [
             batch.step(self._actions[numbers])
             for batch, numbers in zip(self.batches, self._slices, strict=True)
@@ -121,7 +151,7 @@ class GymnasiumVecEnv(VecEnv):
         return observations, rewards.astype(np.float32), ended, infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
-        """Return a picture of each environment, if the batches render."""
+        """Return a picture of each environment, if the batches render; otherwise []."""
         images: list[NDArray[np.uint8]] = []
         for batch in self.batches:
             images += batch.render() or ()
@@ -133,7 +163,11 @@ class GymnasiumVecEnv(VecEnv):
             batch.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of each environment's batch, or the spec of one environment."""
+        """Return the value of the attribute `attr_name` for each environment in `indices`.
+
+        The value is that of the environment's batch. The attribute "spec" is the spec of one
+        environment. `indices` is an index, several indices, or None for all environments.
+        """
         values = [self.spec] * self.num_envs
         if attr_name != "spec":
             values = []
@@ -142,7 +176,7 @@ class GymnasiumVecEnv(VecEnv):
         return [values[index] for index in self._get_indices(indices)]
 
     def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
-        """Refuse: an environment of a batch has no methods or attributes for itself."""
+        """Raise a NotImplementedError: no environment of a batch has methods of its own."""
         raise NotImplementedError(f"use `batches`, for all at once, got {args or kwargs}")
 
     set_attr = env_method
@@ -150,12 +184,19 @@ class GymnasiumVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[Any], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return False for each index: a batch holds no wrapped environments."""
+        """Return False for each environment in `indices`: in a batch, none is wrapped.
+
+        `indices` is an index, several indices, or None for all environments. `wrapper_class`
+        does not matter.
+        """
         return [False for _ in self._get_indices(indices)]
 
 
 def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
-    """Concatenate the arrays in the infos of batches that all batches have, by name."""
+    """Return the arrays that the infos of all batches have, concatenated, by name.
+
+    `infos` holds the infos of each batch.
+    """
     common_names = set(infos[0]).intersection(*infos[1:])
     joined = {}
     for name, values in infos[0].items():
@@ -165,7 +206,11 @@ def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _infos_of_one(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
-    """Return the infos of one environment of a batch, as the environment alone returns them."""
+    """Return the info that one environment of a batch would return if it were alone.
+
+    `infos` are the infos of the batch, in arrays, and `row` is the index of the environment in
+    the batch.
+    """
     infos_of_one = {}
     for name, values in infos.items():
         is_of_plant = not name.startswith("final_") and f"_{name}" in infos
@@ -189,19 +234,20 @@ def make_vec_env(
     Parameters
     ----------
     env, **arguments
-        An id or an `EnvSpec`, and further arguments for it, as in `gymnasium.make`.
+        An id or an `EnvSpec`, and further arguments of `gymnasium.make` for the environment.
         `render_mode` may be "rgb_array".
     n_envs
         Number of plants.
     seed
-        Seed of the first plant at the first reset; plant i has `seed + i // group`. The seed of
-        a model, if it has one, replaces this seed.
+        Seed of the first plant at the first reset; plant i has the seed `seed + i // group`. A
+        model that is made with a seed replaces this seed. None stands for a random seed.
     group
-        Number of neighbouring plants that share a seed: they have the same noise, load and
-        set points, and differ only in the actions that a policy explores.
+        Number of neighbouring plants that share a seed: plants of a group have the same noise,
+        load and set points, and differ only in the actions that a policy explores.
     wrapper
-        Adds `IncrementalAction`: its arguments, or the class itself for its defaults. Other
-        wrappers cannot take a batch: use `stable_baselines3.common.env_util.make_vec_env`.
+        The arguments of an `IncrementalAction` to wrap the plants in, or the class
+        `IncrementalAction` for its default arguments; None for no wrapper. Other wrappers
+        cannot wrap a batch: use `stable_baselines3.common.env_util.make_vec_env`.
 
     Raises
     ------
@@ -210,7 +256,7 @@ def make_vec_env(
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
-    render_mode = arguments.pop("render_mode", None)  # of the batch alone, not of its spec
+    render_mode = arguments.pop("render_mode", None)  # for the batch, but not for its spec
     single = make_one(env, arguments)
     if isinstance(wrapper, Mapping):
         single = IncrementalAction(single, **wrapper)

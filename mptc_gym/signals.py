@@ -1,11 +1,15 @@
 """Generate the external signals of an episode: set point, noise and load disturbance.
 
-Every signal has three methods. `reset` begins an episode of some plants at k = 0. `next`
-returns the next sample of all plants. `ahead` takes the place of `next` where there is one
-plant only, and returns the next `BLOCK` samples of this plant.
+Every signal class has three methods. `reset` begins an episode of some plants at sample k = 0.
+`next` returns the next sample of all plants. `ahead` takes the place of `next` where there is
+one plant only, and returns the next `BLOCK` samples of this plant.
 
-Noise and disturbance are generated a block of samples at a time: drawing many numbers in one
-call is much faster than drawing the numbers one by one, and gives the same numbers.
+Noise and load disturbance are generated a block of samples at a time: drawing many random
+numbers in one call is much faster than drawing the random numbers one by one, and gives the
+same random numbers.
+
+The names in formulas are those of the paper: set point y_d(k), temperature y(k), coloured noise
+n(k) = C(z^-1) xi(k) with white noise xi, and, not in the paper, load disturbance w(k).
 """
 
 from __future__ import annotations
@@ -21,21 +25,27 @@ from numpy.typing import NDArray
 from mptc_gym.draws import EpisodeStream, Streams
 from mptc_gym.parameters import Parameters, PlantNumbers
 
-# One number per plant, shape (n,); a plant number that all plants share has the shape ().
+# One element per plant, shape (n,); a plant number that all plants share has the shape ().
 Values = NDArray[np.float64]
-Indices = NDArray[np.intp]  # of some plants, sorted
+Indices = NDArray[np.intp]  # the indices of some plants, in ascending order
 StreamsOfPlants = Mapping[int, Streams] | Sequence[Streams]  # by the index of the plant
 
-BLOCK = 600  # samples of a signal generated together
-FOREVER = 1 << 62  # samples: longer than any episode
-PLANTS_AT_A_TIME = 32  # so few that the draws of these plants stay in the processor's cache
-LOAD_INTERVAL = 10  # samples between changes of the load disturbance
-LEVELS_AT_A_TIME = BLOCK // LOAD_INTERVAL  # of the load disturbance, generated together
-ONE = np.zeros(1, np.intp)  # the indices of one plant
+BLOCK = 600  # samples of a signal that are generated together, as single draws are slow
+FOREVER = 1 << 62  # samples: longer than any episode, and small enough to add to another int64
+PLANTS_AT_A_TIME = 32  # so few that their random numbers stay in the processor's cache
+LOAD_INTERVAL = 10  # samples between two changes of the load disturbance, which is slow
+# Values of the load disturbance that are generated together: those of `BLOCK` samples.
+LEVELS_AT_A_TIME = BLOCK // LOAD_INTERVAL
+ONE = np.zeros(1, np.intp)  # `which` for an environment with one plant: the index 0
 
 
 def colours(parameters: Parameters) -> dict[str, Sequence[float]]:
-    """Return the coefficients of C in (28) by the name of each noise that is not always 0."""
+    """Return the coefficients that colour each noise which is not always 0, by name.
+
+    "noise" has the coefficients of the polynomial C of equation (28) of the paper, from z^0 on.
+    The transmitter's "measurement_noise" is white: its only coefficient is 1. A noise whose
+    variance in the arguments `parameters` is 0 is left out.
+    """
     coefficients = {"noise": parameters.c, "measurement_noise": (1.0,)}
     return {
         name: c
@@ -45,28 +55,49 @@ def colours(parameters: Parameters) -> dict[str, Sequence[float]]:
 
 
 class Noise:
-    """One of the noises of many plants, 0 at k = 0.
+    """The plant's noise or the transmitter's noise, for many plants; 0 at k = 0.
 
-    The noise is C(z^-1) xi(k) of (28) if `name` is "noise", and the transmitter's noise if
-    `name` is "measurement_noise". `c` are the coefficients of C. The values of `block` samples
-    are generated at a time.
+    Parameters
+    ----------
+    name
+        "noise" for the coloured noise n(k) = C(z^-1) xi(k) of equation (28) of the paper, with
+        white noise xi; or "measurement_noise" for the noise of the transmitter.
+    c
+        The coefficients of C, from z^0 on.
+    num_envs
+        Number n of plants.
+    block
+        How many samples are generated at a time.
     """
 
     def __init__(self, name: str, c: Sequence[float], num_envs: int, block: int) -> None:
         self._name = name
         self._c = np.array(c)[:, np.newaxis, np.newaxis]
-        # C times the standard deviation of xi, shape (length of C, num_envs, 1).
+        # Coefficients of C times the standard deviation of the white noise xi, degC, shape
+        # (number of coefficients, num_envs, 1).
         self._scaled_c = np.zeros((len(c), num_envs, 1))
-        # The latest xi of each plant, the oldest first, as multiples of the standard deviation.
+        # The latest white noise of each plant, the oldest first, as multiples of the standard
+        # deviation.
         self._past = np.zeros((num_envs, len(c) - 1))
-        # One row per sample, so that the values that all plants need at once are contiguous.
+        # The noise of a block, degC: one row per sample, so that the values that all plants
+        # need at once are contiguous.
         self._block = np.zeros((block, num_envs))
-        self._row = 0  # the next row
+        self._row = 0  # the row of the next sample
 
     def reset(
         self, which: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
     ) -> None:
-        """Begin an episode of some plants, whose numbers are `numbers`."""
+        """Begin an episode of some plants.
+
+        Parameters
+        ----------
+        which
+            The indices of the plants.
+        streams
+            The random number streams of all plants, by index.
+        numbers
+            The plant numbers of these plants, which hold the variance of the noise.
+        """
         deviations = np.sqrt(getattr(numbers, f"{self._name}_variance"))
         self._scaled_c[:, which] = deviations[..., np.newaxis] * self._c
         self._past[which] = 0.0
@@ -79,7 +110,10 @@ class Noise:
             self._fill(which, self._row)
 
     def next(self) -> Values:
-        """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
+        """Return the noise of all plants at the next sample, degC, shape (num_envs,).
+
+        The caller must not modify the result.
+        """
         if self._row == len(self._block):
             self._fill(np.arange(len(self._past)), 0)
             self._row = 0
@@ -88,13 +122,13 @@ class Noise:
         return row
 
     def ahead(self) -> list[float]:
-        """Return the next block of the only plant, degC."""
+        """Return the noise at the samples of the next block, degC, for the only plant."""
         self._fill(ONE, 0)
         noise: list[float] = self._block[:, 0].tolist()
         return noise
 
     def _fill(self, which: Indices, first_row: int) -> None:
-        """Generate the noise of some plants, from a row to the end of the block."""
+        """Generate noise of the plants `which`, from `first_row` to the end of the block."""
         order = len(self._c) - 1
         samples = len(self._block) - first_row
         for start in range(0, len(which), PLANTS_AT_A_TIME):
@@ -115,16 +149,22 @@ class Noise:
 
 
 class Levels:
-    """The levels of a set point, and for how many samples a level is held.
+    """The levels of a set point, in degC, and for how many samples each level is held.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment, of which `setpoint`, `setpoint_amplitude` and
+        `setpoint_period` matter.
 
     Attributes
     ----------
     random : bool
-        Whether levels are drawn: uniformly within +-`amplitude`, degC, and held for a number of
-        samples from `shortest` to `longest`, both included.
+        Whether levels are random: uniform within +-`amplitude`, degC, and each held for a
+        random number of samples from `shortest` to `longest`, both included.
     values, lengths : list
-        The levels, degC, and for how many samples a level holds; after the last level, the
-        first level follows again. Of no use if levels are drawn.
+        The levels, degC, and for how many samples each level holds. After the last level, the
+        first level follows again. Of no use if levels are random.
     """
 
     values: list[float]
@@ -148,10 +188,15 @@ class Levels:
             self.lengths = [1] * (len(self.values) - 1) + [FOREVER]
 
     def next(self, place: int, stream: EpisodeStream) -> tuple[float, int]:
-        """Return a level, degC, and for how many samples the level holds.
+        """Return a level of the set point, degC, and for how many samples the level holds.
 
-        If levels are random, the level is drawn from the stream. Otherwise, the level is number
-        `place` of the episode, counted from 0.
+        Parameters
+        ----------
+        place
+            The number of the level in the episode, counted from 0. Of no use if levels are
+            random.
+        stream
+            The random number stream from which a random level is drawn.
         """
         if self.random:
             level = stream.generator.uniform(-self.amplitude, self.amplitude)
@@ -162,14 +207,20 @@ class Levels:
 
 
 class _HeldValues(ABC):
-    """Values of many plants; each value is held until the time of its next change.
+    """A signal of many plants whose value is held until the time of the next change.
 
     Times are counted in samples since the plants were created.
+
+    Parameters
+    ----------
+    num_envs
+        Number n of plants.
 
     Attributes
     ----------
     present : ndarray of float64
-        The present values of all plants, degC, shape (num_envs,); only to be read.
+        The present value of each plant, degC, shape (num_envs,). Other objects must not modify
+        the array.
     """
 
     def __init__(self, num_envs: int) -> None:
@@ -179,40 +230,60 @@ class _HeldValues(ABC):
         self._earliest_due = 0
 
     def next(self) -> Values:
-        """Return the next values of all plants, degC, shape (num_envs,); only to be read."""
+        """Return the values of all plants at the next sample, degC, shape (num_envs,).
+
+        The caller must not modify the result.
+        """
         self._clock += 1
         if self._clock >= self._earliest_due:
             self._make_due_changes()
         return self.present
 
     def _make_due_changes(self) -> None:
-        # A level may hold for 0 samples, as with a period of 1: then the value changes again.
+        """Change the value of each plant whose time of change has come, until none is due."""
+        # A level may hold for 0 samples, as with a period of 1: the value then changes again at
+        # once.
         while self._clock >= self._earliest_due:
             self._change(self._due <= self._clock)
             self._earliest_due = int(self._due.min())
 
     @abstractmethod
     def _change(self, is_due: NDArray[np.bool_]) -> None:
-        """Change the values that are due, and set the times of the next changes."""
+        """Change the values that are due, and set the times of their next changes.
+
+        `is_due` has the shape (num_envs,): True for the plants whose value changes.
+        """
 
 
 class SetPoint(_HeldValues):
-    """The set point y_d(k) of many plants."""
+    """The set point y_d(k) of many plants, in degC.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment.
+    num_envs
+        Number n of plants.
+    """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         super().__init__(num_envs)
         self._levels = Levels(parameters)
         self._level_values = np.array(self._levels.values)
         self._level_lengths = np.array(self._levels.lengths)
-        self._places = np.zeros(num_envs, np.intp)  # of each plant's next level
+        self._places = np.zeros(num_envs, np.intp)  # index of each plant's next level
 
     def reset(self, which: Indices, streams: StreamsOfPlants) -> Values:
-        """Begin an episode of some plants, and return y_d(0), degC, shape (len(which),)."""
+        """Begin an episode of some plants, and return y_d(0), degC, shape (len(which),).
+
+        `which` holds the indices of the plants, and `streams` the random number streams of all
+        plants.
+        """
         self._streams = streams
         if self._levels.random:
             for i in which.tolist():
                 streams[i].setpoint.next_episode()
-        # The first level begins now.
+        # The first level of the episode begins at the present sample.
         self._places[which] = 0
         self._due[which] = self._clock
         self._earliest_due = self._clock
@@ -220,7 +291,7 @@ class SetPoint(_HeldValues):
         return self.present[which]
 
     def ahead(self) -> list[float]:
-        """Return the next block of the only plant, degC."""
+        """Return the set points of the next `BLOCK` samples, degC, for the only plant."""
         level = self.present.item()
         place = self._places.item()
         remaining = self._earliest_due - self._clock - 1  # samples with the present level
@@ -238,6 +309,7 @@ class SetPoint(_HeldValues):
         return values
 
     def _change(self, is_due: NDArray[np.bool_]) -> None:
+        """Begin the next level of the set point where `is_due`, shape (num_envs,), is True."""
         which = np.flatnonzero(is_due)
         if self._levels.random:
             for i in which.tolist():
@@ -251,23 +323,30 @@ class SetPoint(_HeldValues):
 
 
 class Disturbance(_HeldValues):
-    """The load disturbance w(k): the sum of steps and a random walk, both starting at 0.
+    """The load disturbance w(k), degC: the sum of steps and a random walk, both starting at 0.
 
-    The load changes every `LOAD_INTERVAL` samples. The walk then takes a uniform step of the
-    required variance; the sum of many such steps is close to normal. With a probability of
-    `LOAD_INTERVAL / disturbance_interval`, the other part jumps to a new level, uniform within
+    The load changes every `LOAD_INTERVAL` samples. At each change, the walk takes a random
+    step, uniform, whose variance gives the walk the required variance per sample; the sum of
+    many such steps is close to normal. Also at each change, the sum of steps jumps, with a
+    probability of `LOAD_INTERVAL / disturbance_interval`, to a new level, uniform within
     +-`disturbance_amplitude`.
+
+    Parameters
+    ----------
+    num_envs
+        Number n of plants.
     """
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
-        self._amplitudes = np.zeros(num_envs)  # of the steps, degC
-        self._probabilities = np.zeros(num_envs)  # of a jump to a new level at a change
+        self._amplitudes = np.zeros(num_envs)  # largest magnitude of a level, degC
+        self._probabilities = np.zeros(num_envs)  # probability of a jump at each change
         self._widths = np.zeros(num_envs)  # half widths of the steps of the walk, degC
-        # Steps and walk at the latest change that has been generated, degC.
+        # The sum of steps and the walk at the latest change that has been generated, degC.
         self._last_steps = np.zeros(num_envs)
         self._last_walk = np.zeros(num_envs)
-        self._levels = np.zeros((num_envs, LEVELS_AT_A_TIME))  # generated ahead, degC
+        # Values of the load at the next changes, generated ahead, degC.
+        self._levels = np.zeros((num_envs, LEVELS_AT_A_TIME))
         # Indices in the flattened levels: the end of each plant's row, and the next level.
         self._ends = np.arange(1, num_envs + 1) * LEVELS_AT_A_TIME
         self._places = self._ends.copy()
@@ -275,14 +354,22 @@ class Disturbance(_HeldValues):
     def reset(
         self, which: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
     ) -> None:
-        """Begin an episode of some plants, whose numbers are `numbers`.
+        """Begin an episode of some plants.
 
-        The numbers have been drawn from the plant's stream, which the disturbance continues.
+        Parameters
+        ----------
+        which
+            The indices of the plants.
+        streams
+            The random number streams of all plants. Each plant's stream `plant` must already
+            have drawn the plant numbers: the load continues this stream.
+        numbers
+            The plant numbers of these plants, which hold size and interval of the changes.
         """
         self._streams = streams
         self._amplitudes[which] = numbers.disturbance_amplitude
         self._probabilities[which] = LOAD_INTERVAL / numbers.disturbance_interval
-        # Uniform within +-h, a step of the walk has the variance h^2 / 3.
+        # A step of the walk is uniform within +-h and so has the variance h^2 / 3.
         self._widths[which] = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
         self._last_steps[which] = 0.0
         self._last_walk[which] = 0.0
@@ -290,17 +377,19 @@ class Disturbance(_HeldValues):
         self._places[which] = self._ends[which]
         self._due[which] = self._clock + LOAD_INTERVAL
         self._earliest_due = int(self._due.min())
-        # Samples of the only plant before the next levels; see `ahead`.
+        # Samples, degC, that `ahead` returns before the levels that are generated next: the
+        # load stays 0 until the first change.
         self._ahead = [0.0] * (LOAD_INTERVAL - 1)
 
     def ahead(self) -> list[float]:
-        """Return the next block of the only plant, degC."""
+        """Return the load at the next `BLOCK` samples, degC, for the only plant."""
         self._refill(ONE)
         samples = [*self._ahead, *np.repeat(self._levels[0], LOAD_INTERVAL).tolist()]
         self._ahead = samples[BLOCK:]
         return samples[:BLOCK]
 
     def _change(self, is_due: NDArray[np.bool_]) -> None:
+        """Take the next level of the load where `is_due`, shape (num_envs,), is True."""
         is_empty = self._places == self._ends
         self._refill(np.flatnonzero(is_due & is_empty))
         next_levels = self._levels.take(self._places, mode="clip")
@@ -309,7 +398,7 @@ class Disturbance(_HeldValues):
         self._due += LOAD_INTERVAL * is_due
 
     def _refill(self, which: Indices) -> None:
-        """Generate the next levels of some plants."""
+        """Generate the next `LEVELS_AT_A_TIME` levels of the load for the plants `which`."""
         for start in range(0, len(which), PLANTS_AT_A_TIME):
             plants = which[start : start + PLANTS_AT_A_TIME]
             draws = np.empty((len(plants), LEVELS_AT_A_TIME, 3))
@@ -319,10 +408,16 @@ class Disturbance(_HeldValues):
         self._places[which] = self._ends[which] - LEVELS_AT_A_TIME
 
     def _generate(self, plants: Indices, draws: Values) -> Values:
-        """Return the next levels w of some plants, degC, shape (plants, levels).
+        """Return the next levels of the load w for some plants, degC, shape (plants, levels).
 
-        `draws` are uniform from 0 to 1, shape (plants, levels, 3): for the steps of the walk,
-        for whether a new level begins, and for this level.
+        Parameters
+        ----------
+        plants
+            The indices of the plants.
+        draws
+            Random numbers, uniform from 0 to 1, shape (plants, levels, 3). The last axis holds
+            the number for a step of the walk, the number that decides whether the load jumps to
+            a new level, and the number for this new level.
         """
         walk_draws, jump_draws, level_draws = np.moveaxis(draws, -1, 0)
         walk_steps = (2.0 * walk_draws - 1.0) * self._widths[plants, np.newaxis]
@@ -331,8 +426,8 @@ class Disturbance(_HeldValues):
 
         new_levels = (2.0 * level_draws - 1.0) * self._amplitudes[plants, np.newaxis]
         candidates = np.hstack((self._last_steps[plants, np.newaxis], new_levels))
-        # The level at a change is the candidate of the latest jump; the first candidate is the
-        # level before these changes.
+        # The sum of steps at a change is the candidate of the latest jump up to this change.
+        # The first candidate is the sum of steps before the changes that are generated now.
         jumps = jump_draws < self._probabilities[plants, np.newaxis]
         jump_indices = np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0)
         latest_jumps = np.maximum.accumulate(jump_indices, axis=1)
@@ -354,9 +449,16 @@ class Signals(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Parameters, num_envs: int = 1, block: int = BLOCK) -> Signals:
-        """Return the signals of plants with these parameters.
+        """Return the signals of plants with the arguments `parameters`.
 
-        `block` samples of noise are generated at a time.
+        Parameters
+        ----------
+        parameters
+            The arguments of the environment.
+        num_envs
+            Number n of plants.
+        block
+            How many samples of noise are generated at a time.
         """
         noises: dict[str, Noise] = {}
         for name, c in colours(parameters).items():
@@ -373,7 +475,17 @@ class Signals(NamedTuple):
     ) -> Values:
         """Begin an episode of some plants, and return y_d(0), degC, shape (len(which),).
 
-        Noise, disturbance and measurement noise are 0 at k = 0.
+        Noise, load disturbance and measurement noise are 0 at k = 0.
+
+        Parameters
+        ----------
+        which
+            The indices of the plants.
+        streams
+            The random number streams of all plants, by index.
+        numbers
+            The plant numbers of these plants: an array has the shape (len(which),), or () for a
+            number that all plants share.
         """
         for signal in (self.noise, self.disturbance, self.measurement_noise):
             if signal is not None:
@@ -381,9 +493,9 @@ class Signals(NamedTuple):
         return self.setpoint.reset(which, streams)
 
     def ahead(self) -> list[tuple[float, ...]]:
-        """Return the next `BLOCK` samples of the only plant.
+        """Return the next `BLOCK` samples of all signals, where there is one plant only.
 
-        A sample is a tuple of y_d, n, w and the measurement noise, degC.
+        A sample is a tuple of set point y_d, noise n, load w and measurement noise, degC.
         """
         columns: list[list[float]] = []
         for signal in self:

@@ -41,7 +41,8 @@ from mptc_gym.torch_episodes import (
 from mptc_gym.torch_plant import TorchPlants
 from mptc_gym.torch_signals import make_signals
 
-_IN_CACHE = 1 << 17  # numbers processed at once
+# Most numbers in a block of a signal on a CPU: 512 KiB of float32, which fit in the cache.
+_IN_CACHE = 1 << 17
 
 
 class MiddlePointTorchEnv(BatchEnv):
@@ -67,8 +68,8 @@ class MiddlePointTorchEnv(BatchEnv):
         torch.float32 or torch.float64: the type of all computations and of the observations.
         The type of the spaces is always float32.
     differentiable
-        Whether observations, rewards and infos carry the graph that leads back to the actions
-        of this and of earlier steps; see Gradients.
+        Whether observations, rewards and infos carry PyTorch's gradient graph back to the
+        actions of the present and of earlier steps; see Gradients.
     **arguments
         The arguments of `MiddlePointEnv` except `render_mode`. All plants have the same
         arguments, but where an argument is a range, every plant draws its own number.
@@ -76,7 +77,7 @@ class MiddlePointTorchEnv(BatchEnv):
     Attributes
     ----------
     autoreset_mode : AutoresetMode
-        How ended episodes are reset.
+        When the plant of an ended episode is reset: see `MiddlePointVectorEnv`.
     checks_actions : bool
         Whether `step` refuses actions that are not finite; see Waiting.
 
@@ -92,34 +93,36 @@ class MiddlePointTorchEnv(BatchEnv):
     **Random numbers.** All random numbers come from one `torch.Generator` on the device, which
     `reset(seed=seed)` restarts. The same seed, arguments and resets give the same numbers on
     the same device, with the same versions of this package and of PyTorch. The random numbers
-    have the same distributions as in NumPy, but other values. The j-th episode of a plant
-    depends on the length of earlier episodes and on the other plants. So compare controllers in
-    NumPy, or on external signals.
+    have the distributions of `MiddlePointVectorEnv`, but other values. The j-th episode of a
+    plant depends on the length of earlier episodes and on the other plants. So compare
+    controllers in `MiddlePointVectorEnv`, or on external signals.
 
     **External signals.** `reset(options={"signals": signals})` takes a dict of tensors. "noise"
-    (n), "setpoint" (y_d), "disturbance" (w) and "measurement_noise", degC, have the shape
-    (samples, num_envs), with sample k in row k. Arguments that are ranges have the shape
-    (num_envs,), under their names. If a tensor has a further, leading dimension, the j-th
-    episode of a plant gets the j-th element; after the last element, the first element follows
-    again. Signals and arguments that are not in the dict are drawn. A step beyond the last
-    sample of a signal raises a ValueError.
+    (the noise n), "setpoint" (the set point y_d), "disturbance" (the load w) and
+    "measurement_noise", degC, have the shape (samples, num_envs), with sample k in row k. The
+    dict may also hold a number per plant, shape (num_envs,), for each argument that is a range,
+    under the argument's name. If a tensor has a further, leading dimension, the j-th episode of
+    a plant gets the j-th element; after the last element, the first element follows again.
+    Signals and arguments that are not in the dict are random. A step beyond the last sample of
+    a signal raises a ValueError.
 
-    **Gradients.** The gradient goes straight through the dead zone, as if there were no dead
-    zone, so a policy also learns from commands without effect, whose true gradient is 0. The
-    gradient is 0 beyond the actuator's limits and beyond the transmitter's span. `detach` cuts
-    the graph for truncated backpropagation. An action affects the output after `delay` + 1
-    samples, so a shorter segment between two calls of `detach` has no gradient. Without
-    `differentiable`, the environment keeps no graph. A copy or a pickle, also in mid-episode,
-    has no graph of earlier actions.
+    **Gradients.** The gradient of rewards and observations with respect to actions goes
+    straight through the dead zone, as if there were no dead zone: so a policy also learns from
+    commands without effect, whose true gradient is 0. The gradient is 0 beyond the actuator's
+    limits and beyond the transmitter's span. `detach` cuts the gradient graph for truncated
+    backpropagation. An action affects the temperature after `delay` + 1 samples, so a segment
+    of fewer samples between two calls of `detach` has no gradient through the plant. Without
+    `differentiable`, the environment keeps no gradient graph. A copy or a pickle of the
+    environment, also in mid-episode, has no gradient graph of earlier actions.
 
     **Waiting.** `step` never waits for the device. So `step` refuses actions that are not
-    finite only on the CPU; on other devices, plants with such an action show NaN until they
-    are reset. `reset` may wait.
+    finite only on the CPU; on other devices, a plant whose action is not finite may show NaN
+    until the plant is reset. `reset` may wait for the device.
 
     **Memory.** The caller may keep or overwrite the tensors that a step returns, except the
     masks and the drift factors in the infos, which several steps may share. Tensors of several
-    steps may share a block of memory, which is freed with the last of these tensors. Columns of
-    observations are contiguous.
+    steps may share a block of memory, which is freed with the last of these tensors. The
+    observations, shape (num_envs, size), are contiguous by column, not by row.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as in VectorEnv)
@@ -151,16 +154,16 @@ class MiddlePointTorchEnv(BatchEnv):
         self.dtype = dtype
         self.differentiable = differentiable
         self.checks_actions = self.device.type == "cpu"
-        self._action = self._zeros  # of the last step
+        self._action = self._zeros  # the actions of the last step, shape (n,)
 
         self._episodes = Episodes(self.parameters, self._zeros)
         self._plants = TorchPlants(self.parameters, self._episodes)
         self._drawn_signals = make_signals(self.parameters, self._episodes)
-        self._signals = self._drawn_signals  # drawn or external, by name
+        self._signals = self._drawn_signals  # random or external signals, by name
         self._external: dict[str, External] = {}  # external signals and plant numbers
         self._last_sample = FOREVER  # the last k for which all external signals have a value
-        # On a CPU, a block must fit in the processor's cache. On other devices, blocks are as
-        # long as possible, since every call of PyTorch takes long.
+        # On a CPU, a block of samples must fit in the processor's cache. On other devices,
+        # blocks are as long as possible, since every call of PyTorch takes long.
         in_cache = LONGEST
         if self.device.type == "cpu":
             in_cache = max(1, _IN_CACHE // num_envs)
@@ -171,27 +174,27 @@ class MiddlePointTorchEnv(BatchEnv):
         # terminations, truncations and infos.
         self._ahead: list[tuple[Tensor, Tensor, Tensor, Infos]] = []
         self._window = _Window(self.parameters.windows, self._zeros)
-        self._loads = History(self._zeros, 1)  # w, degC
+        self._loads = History(self._zeros, 1)  # load w, degC
 
     __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> MiddlePointTorchEnv:
-        """Return a copy, also in mid-episode, without the graph of earlier actions."""
+        """Return a copy, also in mid-episode, without the gradient graph of earlier actions."""
         duplicate: MiddlePointTorchEnv = pickle.loads(pickle.dumps(self))
         return duplicate
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of a pickle, which has lost the graph of earlier actions."""
+        """Take the state of a pickle, which has lost the gradient graph of earlier actions."""
         vars(self).update(state)
         self.detach()
 
     def detach(self) -> None:
-        """Cut the graph that leads to earlier actions, for truncated backpropagation.
+        """Cut the gradient graph to earlier actions, for truncated backpropagation.
 
-        The tensors that later steps return then depend only on actions after this call. The
-        tensors that earlier steps have returned stay attached. So detach the latest
-        observation, too, before the policy sees it: otherwise the next action depends on
-        earlier actions through this observation.
+        The tensors that later steps return then depend only on actions after the call of
+        `detach`. The tensors that earlier steps have returned stay attached to the graph. So
+        also detach the latest observation before the policy sees this observation: otherwise
+        the next action depends on earlier actions through the observation.
         """
         self._plants.detach()
         self._window.detach()
@@ -201,6 +204,10 @@ class MiddlePointTorchEnv(BatchEnv):
             self._ahead[k] = rewards.detach(), terminations, truncations, detached
 
     def _advance(self, a: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
+        """Move all plants by one sample, and return what `step` returns if no episode ends.
+
+        `a` are the checked actions, shape (num_envs,).
+        """
         command, applied = self._plants.apply(a)
         if not self._ahead:
             self._compute_block()
@@ -208,16 +215,17 @@ class MiddlePointTorchEnv(BatchEnv):
         observations = self._window.next(a)
         if self.parameters.move_weight:
             rewards = rewards - self.parameters.move_weight * (a - self._action).abs()
-            self._action = a.clone()  # the caller may overwrite it
+            self._action = a.clone()  # a copy, as the caller may overwrite the actions
         infos["command"] = command
         infos["applied"] = applied
         return observations, rewards, terminations, truncations, infos
 
     def _compute_block(self) -> None:
-        """Compute what the next steps return, except commands, applied flows and move costs.
+        """Compute what the steps of a block return, except what depends on later actions.
 
-        An action affects the output after the delay only, so the outputs of a block follow from
-        the actions so far.
+        An action affects the temperature only after the delay, so the temperatures of a block
+        follow from the actions so far. Commanded flows, applied flows and the cost of moves are
+        left to each step.
         """
         samples = max(1, min(self._block, self._first_end - self._clock + 1))
         block = self._episodes.block(self._clock, samples)
@@ -245,7 +253,8 @@ class MiddlePointTorchEnv(BatchEnv):
             "noise": noise.unbind(),
         }
         if load is not None:
-            rows_by_name["disturbance"] = load.clone().unbind()  # the caller may overwrite it
+            # A copy, as the caller may overwrite the infos.
+            rows_by_name["disturbance"] = load.clone().unbind()
             self._loads.extend(load.unbind())
         if self.parameters.drifts:
             rows_by_name |= zip(FACTORS, zip(*factors, strict=True), strict=True)
@@ -256,20 +265,27 @@ class MiddlePointTorchEnv(BatchEnv):
             self._ahead.append((rewards[k], flags[k], flags[samples + k], infos | masks))
 
     def _rewards(self, error: Tensor) -> Tensor:
-        """Return the rewards of errors, degC, without the cost of moves."""
+        """Return the rewards of errors, degC, of any shape, without the cost of moves."""
         scale = self.parameters.error_scale
         if self.parameters.reward == "quadratic":
             zero = error.new_zeros(())
-            return torch.addcmul(zero, error, error, value=-0.5 / scale**2)  # (12)
+            # The paper's cost, equation (12), negated and scaled.
+            return torch.addcmul(zero, error, error, value=-0.5 / scale**2)
         return error.abs().mul_(-1.0 / scale)
 
     def _begin(self, mask: Mask) -> dict[str, Tensor]:
+        """Begin an episode of the plants in the mask; return the infos at k = 0 that are not 0.
+
+        The infos are tensors of shape (num_envs,); elements of plants outside the mask have no
+        meaning.
+        """
         flags = self._as_array(mask)
         rows_to_drop = len(self._ahead)
         self._ahead = []
         if mask.all():
-            # No plant needs the past, and signals that were external in the last episode, but
-            # are drawn from now on, have no samples of the latest block to drop.
+            # If all plants are reset, no plant needs past samples. Signals that were external
+            # in the last episode, but are random from now on, have no samples of the latest
+            # block to drop.
             rows_to_drop = 0
             self.detach()
         first_infos = self._episodes.reset(flags, self._clock, self._starts, self._external)
@@ -290,14 +306,21 @@ class MiddlePointTorchEnv(BatchEnv):
         return first_infos
 
     def _final(self, ended: Mask, observations: Tensor) -> Tensor:
+        """Return the last observations of plants whose episode has just ended, and 0 elsewhere.
+
+        `ended` is True for these plants, shape (num_envs,). `observations`, and the result,
+        have the shape (num_envs, size).
+        """
         return torch.where(self._as_array(ended)[:, None], observations, 0)
 
     def _as_array(self, values: NDArray[Any]) -> Tensor:
+        """Return a mask or integers, shape (num_envs,), as a new tensor on the device."""
         on_host = torch.from_numpy(values)
         on_device: Tensor = torch.empty(self.num_envs, dtype=on_host.dtype, device=self.device)
-        return on_device.copy_(on_host, non_blocking=True)  # without waiting
+        return on_device.copy_(on_host, non_blocking=True)  # without waiting for the device
 
     def _hidden_state(self) -> tuple[dict[str, Any], Tensor]:
+        """Return the drawn plant numbers by name, and the load w, degC, for `plant_state`."""
         numbers = {name: self._episodes.numbers[name] for name in self.parameters.ranges}
         load = self._zeros
         if self.parameters.is_disturbed:
@@ -305,6 +328,11 @@ class MiddlePointTorchEnv(BatchEnv):
         return numbers, load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
+        """Check the seed and the options of a `reset` of the plants in `mask`, and apply both.
+
+        A ValueError is raised if the seed is no integer from 0 to 2^63 - 1, or if the options
+        hold signals that are not allowed.
+        """
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
             reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
         if "reset_mask" in options:
@@ -321,6 +349,11 @@ class MiddlePointTorchEnv(BatchEnv):
         self._np_random_seed = self._episodes.generator.initial_seed()
 
     def _checked_actions(self, actions: Any) -> Tensor:
+        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended.
+
+        A ValueError is raised if the actions do not have the shape (num_envs, 1), if an action
+        is not finite (on the CPU), or if an external signal has ended.
+        """
         columns = actions
         if not (isinstance(actions, Tensor) and actions.dtype is self.dtype):
             columns = as_tensor(actions, self._zeros)
@@ -332,7 +365,8 @@ class MiddlePointTorchEnv(BatchEnv):
         if self._ended is not None:
             a = a.masked_fill(self._as_array(self._ended), 0.0)
         if self.checks_actions:
-            # The sum of squares is finite if all actions are, unless an action is huge.
+            # The sum of squares, which is fast, is finite if all actions are finite and none is
+            # huge.
             values = a.detach() if a.requires_grad else a
             if not math.isfinite(values.dot(values).item()) and not values.isfinite().all():
                 reject("actions", actions, "finite")
@@ -392,25 +426,39 @@ def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePoint
 class _Window:
     """The observations of all plants.
 
-    `windows` are the sizes of the blocks of set points, errors, outputs and actions.
+    Parameters
+    ----------
+    windows
+        How many set points, errors, outputs and past actions an observation holds.
+    zeros
+        Zeros of the device and type to use, shape (n,).
     """
 
     def __init__(self, windows: Sequence[int], zeros: Tensor) -> None:
         *self._windows, self._past_actions = windows
         self._zeros = zeros
-        # Set points, errors and outputs.
+        # The histories of set points, errors and outputs, degC.
         self._histories = [History(zeros, window) for window in self._windows]
         self._actions = zeros.expand(self._past_actions, -1)  # the newest first
-        # Observations of the block to come, without actions, the next one last.
+        # Observations of the rest of the block, without past actions, the next sample last.
         self._stacked: list[Tensor] = []
 
     def reset(
         self, mask: Tensor, rows_to_drop: int, setpoint: Tensor, rest_action: Tensor
     ) -> None:
-        """Begin an episode of the plants in a mask, at rest; all tensors have the shape (n,).
+        """Begin an episode of some plants, at rest. All tensors have the shape (n,).
 
-        `setpoint` is y_d(0), degC, and `rest_action` is the action for u = 0. `rows_to_drop`
-        samples at the end of the latest block are dropped.
+        Parameters
+        ----------
+        mask
+            True for the plants to reset.
+        rows_to_drop
+            How many samples at the end of the latest block are dropped, as the environment has
+            not returned them.
+        setpoint
+            Set points y_d(0), degC.
+        rest_action
+            Actions for a flow of 0 t/h.
         """
         setpoints, errors, outputs = self._histories
         setpoints.reset(mask, rows_to_drop, newest=setpoint)
@@ -419,7 +467,10 @@ class _Window:
         self._actions = torch.where(mask, rest_action.clamp(-1.0, 1.0), self._actions)
 
     def extend(self, *blocks: Tensor) -> None:
-        """Add a block of set points, errors and outputs, each of shape (samples, n)."""
+        """Add a block of set points, errors and outputs, in this order.
+
+        Each tensor in `blocks` has the shape (samples, n), degC.
+        """
         for history, window, block in zip(self._histories, self._windows, blocks, strict=True):
             if window:
                 history.extend(block.unbind())
@@ -427,7 +478,10 @@ class _Window:
         self._stacked = self._stack(samples, first_place=1)[::-1]
 
     def next(self, a: Tensor) -> Tensor:
-        """Return the observations of the next sample of the block, given the action before."""
+        """Return the observations of the next sample of the block, shape (n, size).
+
+        `a` are the actions that led to this sample, shape (n,).
+        """
         observations = self._stacked.pop()
         if self._past_actions:
             newest = a.clamp(-1.0, 1.0)[None]
@@ -436,25 +490,26 @@ class _Window:
         return observations.t()
 
     def present(self) -> Tensor:
-        """Return the observations after a reset."""
+        """Return the observations after a reset, shape (n, size)."""
         return torch.cat((*self._stack(1, first_place=0), self._actions)).t()
 
     def detach(self) -> None:
-        """Cut the graph that leads to earlier actions."""
+        """Cut the gradient graph from stored observations to earlier actions."""
         for history in self._histories:
             history.detach()
         self._stacked = [observations.detach() for observations in self._stacked]
         self._actions = self._actions.detach()
 
     def _stack(self, samples: int, first_place: int) -> list[Tensor]:
-        """Return the observations of some samples, without actions, each of shape (size, n).
+        """Return the observations of `samples` samples, in tensors of shape (size, n).
 
-        The first observation begins at `first_place` of the histories.
+        Past actions are left out. The first observation begins at index `first_place` of the
+        histories.
         """
         newest_first: list[Tensor] = []
         for place in range(first_place, first_place + samples):
             for history, window in zip(self._histories, self._windows, strict=True):
                 newest_first += history.rows[place : place + window][::-1]
-        if not newest_first:  # the observation has actions alone
+        if not newest_first:  # the observation holds past actions alone
             return [self._zeros.new_empty(0, len(self._zeros))] * samples
         return [*torch.stack(newest_first).view(samples, -1, len(self._zeros)).unbind()]

@@ -1,8 +1,8 @@
 """Keep the episodes of many plants in PyTorch: times, plant numbers, values from outside.
 
 The environment computes blocks of samples ahead. Times are counted in steps of the environment.
-A reset of some plants may come before the environment has returned all samples of a block. Then
-the unused samples at the end of the block are dropped, and computed anew for all plants.
+A reset of some plants may come before the environment has returned all samples of a block. The
+unused samples at the end of the block are then dropped, and computed anew for all plants.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,13 +17,16 @@ from mptc_gym.checks import reject
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import DRIFT_INTERVAL
 
-LONGEST = 64  # most samples in a block
-SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")
-Number = float | Tensor  # one for all plants, or one per plant, shape (n,)
+LONGEST = 64  # most samples in a block, which bounds the memory of a block
+SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")  # signals from outside
+Number = float | Tensor  # a float for all plants, or an element for each plant, shape (n,)
 
 
 def as_tensor(values: Any, like: Tensor) -> Tensor | None:
-    """Return numbers in a tensor with the type and device of `like`; None for other values."""
+    """Return numbers as a tensor of the type and on the device of `like`.
+
+    The result is None if PyTorch cannot convert `values`.
+    """
     try:
         return torch.as_tensor(values, dtype=like.dtype, device=like.device)
     except (TypeError, ValueError, RuntimeError, OverflowError):
@@ -31,24 +34,35 @@ def as_tensor(values: Any, like: Tensor) -> Tensor | None:
 
 
 class Block(NamedTuple):
-    """A block of samples that are computed at once: the samples stand in rows."""
+    """A block of consecutive samples that are computed at once: one row for each sample."""
 
-    first_time: int  # of row 0
-    samples: int
+    first_time: int  # time of row 0, in steps of the environment
+    samples: int  # number of rows
     starts: Tensor | int  # time at k = 0 of each plant, shape (n,), or one time for all plants
     due_rows: list[int]  # rows at which the load and the drifts of some plant are due to change
 
     def age(self, row: int) -> Tensor | int:
-        """Return the k of a row, shape (n,), or one number for all plants."""
+        """Return the sample k of a row, shape (n,), or one number for all plants."""
         return self.first_time + row - self.starts
 
     def ages(self, device: torch.device) -> Tensor:
-        """Return the k of all rows, shape (samples, n), or (samples, 1) for all plants."""
+        """Return the sample k of all rows, on the given device.
+
+        The shape is (samples, n), or (samples, 1) if the episodes of all plants began at one
+        time.
+        """
         return torch.arange(self.samples, device=device)[:, None] + self.age(0)
 
 
 class History:
     """The latest values of a quantity of n plants: one tensor of shape (n,) for each sample.
+
+    Parameters
+    ----------
+    zeros
+        Zeros of the device and type to use, shape (n,).
+    length
+        How many samples before the latest block are kept.
 
     Attributes
     ----------
@@ -62,14 +76,21 @@ class History:
         self._length = length
 
     def extend(self, block: Sequence[Tensor]) -> None:
-        """Add the values of a block, and forget values that are no longer needed."""
+        """Add the values of a block, each of shape (n,), and forget values of older blocks."""
         self.rows = [*self.rows[len(self.rows) - self._length :], *block]
 
     def reset(self, mask: Tensor, rows_to_drop: int, newest: Tensor | None = None) -> None:
-        """Begin an episode of the plants in a mask, shape (n,), with zeros before k = 0.
+        """Begin an episode of the plants in a mask, with zeros before sample k = 0.
 
-        `rows_to_drop` is the number of samples to drop at the end. `newest` are the values at
-        k = 0, shape (n,); None stands for zeros.
+        Parameters
+        ----------
+        mask
+            True for the plants to reset, shape (n,).
+        rows_to_drop
+            How many samples at the end of the latest block are dropped, as the environment has
+            not returned them.
+        newest
+            The values at k = 0, shape (n,); None stands for zeros.
         """
         end = len(self.rows) - rows_to_drop
         rows = self.rows[end - self._length : end]
@@ -78,12 +99,19 @@ class History:
             self.rows[-1] = torch.where(mask, newest, self.rows[-1])
 
     def detach(self) -> None:
-        """Cut the graph that leads to earlier actions."""
+        """Cut the gradient graph from the values to earlier actions."""
         self.rows = [row.detach() for row in self.rows]
 
 
 class Episodes:
     """The present episodes of n plants: when the episodes began, and the plant numbers.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment.
+    zeros
+        Zeros of the device and type to use, shape (n,).
 
     Attributes
     ----------
@@ -94,7 +122,8 @@ class Episodes:
     numbers : dict
         The plant numbers by name, floats or tensors of shape (n,).
     starts : Tensor or int
-        The time at which each plant's episode began, shape (n,), or one time for all plants.
+        The time at which each plant's episode began, shape (n,), or one time for all plants, in
+        steps of the environment.
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
@@ -103,8 +132,8 @@ class Episodes:
         self.generator.seed()  # from the operating system, until `reset` gets a seed
         self._ranges = parameters.ranges
         tensor_names = set(self._ranges)
-        # If one limit is drawn, both are tensors: PyTorch clamps either between two numbers or
-        # between two tensors.
+        # If one limit of the actuator is random, both limits are tensors: PyTorch clamps either
+        # between two numbers or between two tensors.
         limits = {"u_min", "u_max"}
         if limits & tensor_names:
             tensor_names |= limits
@@ -129,19 +158,20 @@ class Episodes:
         Parameters
         ----------
         mask
-            The plants, shape (n,).
+            True for the plants whose episode begins, shape (n,).
         time
-            The present time.
+            The present time, in steps of the environment.
         starts
             The time at which each plant's present episode began, shape (n,): `time` for the
             plants in the mask.
         external
-            The plant numbers that are not drawn, by name.
+            The plant numbers that come from outside instead of being random, by name.
 
         Returns
         -------
         dict of Tensor
-            The numbers by name, shape (n,); only the numbers of plants in the mask are of use.
+            The plant numbers by name, shape (n,). Only the elements of plants in the mask have
+            a meaning.
         """
         numbers: dict[str, Tensor] = {}
         for name, (low, high) in self._ranges.items():
@@ -161,7 +191,7 @@ class Episodes:
         return numbers
 
     def block(self, first_time: int, samples: int) -> Block:
-        """Return the block of this number of samples from this time on."""
+        """Return the block of `samples` samples from the time `first_time` on."""
         due_rows = [
             row
             for row in range(samples)
@@ -170,14 +200,15 @@ class Episodes:
         return Block(first_time, samples, self.starts, due_rows)
 
     def draw_within_one(self, rows: int) -> Tensor:
-        """Draw numbers uniformly from -1 to 1, 1 excluded, shape (rows, n)."""
+        """Return random numbers, uniform from -1 to 1 (1 excluded), shape (rows, n)."""
         numbers = self.zeros.new_empty(rows, len(self.zeros))
         return numbers.uniform_(-1.0, 1.0, generator=self.generator)
 
     def draw(self, low: float, high: float, is_integer: bool) -> Tensor:
-        """Draw numbers, or integers, uniformly from `low` to `high`, both included.
+        """Return random numbers, uniform from `low` to `high`, both included.
 
-        The result has the shape (n,) and the floating-point type of `zeros`.
+        The numbers are integers if `is_integer` is True. The result has the shape (n,) and
+        always the floating-point type of `zeros`.
         """
         numbers = torch.empty_like(self.zeros)
         numbers.uniform_(low, high + is_integer, generator=self.generator)
@@ -187,16 +218,21 @@ class Episodes:
 
 
 class External:
-    """A signal, or a plant number, that is read from a tensor instead of drawn.
+    """A signal, or a plant number, that is read from a tensor instead of being random.
 
-    The tensor has the shape (episodes, samples, n). After the last episode, the first episode
-    follows again; the value of the last sample of an episode is held. A plant number has
-    one sample, which `reset` returns.
+    After the last episode in the tensor, the first episode follows again. After the last sample
+    of an episode, the value of this sample is held. A plant number has one sample, which
+    `reset` returns.
+
+    Parameters
+    ----------
+    values
+        The values of the signal, degC, or of the plant number, shape (episodes, samples, n).
 
     Attributes
     ----------
     last_sample : int
-        The last k of an episode that has a value.
+        The last sample k of an episode that has a value of its own.
     """
 
     def __init__(self, values: Tensor) -> None:
@@ -206,18 +242,22 @@ class External:
         self.last_sample = values.shape[1] - 1
 
     def reset(self, mask: Tensor, rows_to_drop: int = 0) -> Tensor:
-        """Begin the next episode of some plants, and return the values at k = 0."""
+        """Begin the next episode of the plants in `mask`; return the values at k = 0.
+
+        The values have the shape (n,). `rows_to_drop` is an argument of every signal, but is
+        not needed: `next` reads the values by the sample k alone.
+        """
         self._episode = self._episode + mask
         return self._at(torch.zeros_like(self._episode)[None])[0]
 
     def next(self, block: Block) -> Tensor:
-        """Return the values of a block."""
+        """Return the values at the samples of a block, shape (samples, n)."""
         return self._at(block.ages(self._values.device))
 
     def _at(self, ages: Tensor) -> Tensor:
-        """Return the values at some ages of the present episodes, shape (samples, n).
+        """Return the values of the present episodes at given samples k, shape (samples, n).
 
-        The ages, in samples, have the shape (samples, n) or (samples, 1).
+        `ages` are the samples k, of shape (samples, n), or (samples, 1) for all plants.
         """
         episodes, samples, _ = self._values.shape
         rows = self._episode % episodes * samples + ages.clamp(max=samples - 1)
@@ -225,14 +265,21 @@ class External:
 
 
 def read_signals(signals: Any, parameters: Parameters, zeros: Tensor) -> dict[str, External]:
-    """Check `options["signals"]` of a reset; return the signals and plant numbers by name.
+    """Return the signals and plant numbers in `options["signals"]` of a reset, by name.
 
-    `zeros` have the type and device to use, and the shape (n,). None stands for no signals.
+    Parameters
+    ----------
+    signals
+        A dict of values by name, as in `MiddlePointTorchEnv`; None for no signals from outside.
+    parameters
+        The arguments of the environment.
+    zeros
+        Zeros of the device and type to use, shape (n,).
 
     Raises
     ------
     ValueError
-        If a name is unknown, or a value has the wrong shape, is not finite or out of range.
+        If a name is unknown, or if values have the wrong shape, are not finite or out of range.
     """
     if signals is None:
         return {}
@@ -257,8 +304,22 @@ def _read_values(
 ) -> Tensor:
     """Return the values of a signal or a plant number, shape (episodes, samples, n).
 
-    `ends` are the lowest and the highest value of a plant number; None stands for a signal. A
-    ValueError that names `path` is raised for values that are not allowed.
+    Parameters
+    ----------
+    path
+        What an error message calls the values.
+    value
+        Numbers of shape (samples, n) for a signal, or (n,) for a plant number, or with a
+        leading dimension of episodes.
+    ends
+        The lowest and the highest value of a plant number; None stands for a signal.
+    zeros
+        Zeros of the device and type to use, shape (n,).
+
+    Raises
+    ------
+    ValueError
+        If the values are no finite numbers, or are of a wrong shape or out of range.
     """
     n = len(zeros)
     shape = f"(samples, {n})" if ends is None else f"({n},)"
@@ -267,9 +328,9 @@ def _read_values(
         reject(path, value, "numbers")
     shape_of_values = tuple(values.shape)
     if ends is not None and values.ndim:
-        values = values.unsqueeze(-2)  # the only sample
+        values = values.unsqueeze(-2)  # adds the axis of samples: a plant number has one sample
     if values.ndim == 2:
-        values = values[None]  # the only episode
+        values = values[None]  # adds the axis of episodes, of length 1
     if values.ndim != 3 or values.shape[-1] != n or not values.numel():
         raise ValueError(
             f"{path} must have the shape {shape}, or one more dimension before it, of "

@@ -1,6 +1,9 @@
-"""Move many plants in PyTorch by (28) and (29), a block of samples at a time.
+"""Move many plants in PyTorch, a block of samples at a time.
 
-`PlantBatch` in `mptc_gym.plant` moves many plants in NumPy, a sample at a time.
+The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k), with
+temperature y, applied flow u_a, delay d and white noise xi. The actuator, with dead zone and
+limits, is equation (29). `PlantBatch` in `mptc_gym.plant` moves many plants in NumPy, a sample
+at a time.
 """
 
 from collections import deque
@@ -16,17 +19,26 @@ from mptc_gym.torch_episodes import Block, Episodes, History, Number
 
 
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
-    """Return the flow u_a that the actuator applies, (29), t/h, shape (n,).
+    """Return the flow u_a that the actuator applies, t/h, shape (n,), for a command u.
 
-    A command, t/h, of a magnitude above `edge` passes the dead zone. The limits are both
-    floats, or both of shape (n,). The gradient of the flow is 1 within the limits, also in the
-    dead zone, and 0 beyond the limits.
+    The actuator is equation (29) of the paper: no flow for a command in the dead zone,
+    otherwise the command within the limits. The gradient of the flow is 1 within the limits,
+    also in the dead zone, and 0 beyond the limits.
+
+    Parameters
+    ----------
+    command
+        Commanded flows u, t/h, shape (n,).
+    edge
+        Magnitude above which a command passes the dead zone, t/h: see `least_effective`.
+    u_min, u_max
+        Limits, t/h: two floats, or two tensors of shape (n,).
     """
     are_floats = (
         isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
     )
     if are_floats and not command.requires_grad and u_min <= 0.0 <= u_max:
-        # These two operations are the fastest way to the same numbers.
+        # These two operations give the same numbers as the general way, but are faster.
         shrunk = functional.hardshrink(command, edge)  # type: ignore[arg-type]  # it is a float
         return shrunk.clamp_(u_min, u_max)  # type: ignore[arg-type]
     limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
@@ -35,18 +47,26 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     if not command.requires_grad:
         return limited.mul_(command.abs().gt_(edge))
     passes = command.detach().abs().gt_(edge)
-    # limited + constant * (passes - 1): the same value, but with the gradient of `limited`.
+    # limited + constant * (passes - 1) has the value of limited * passes, but the gradient of
+    # `limited`.
     return torch.addcmul(limited, limited.detach(), passes.sub_(1.0))
 
 
 class TorchPlants:
-    """Many plants side by side, with gradients where the actions have gradients.
+    """Many plants with their actuators in PyTorch, with gradients if the actions have any.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment.
+    episodes
+        The present episodes of the plants, which hold the plant numbers.
 
     Attributes
     ----------
     most_samples : int
-        The longest block: d + 1 samples, with d the shortest delay that can be drawn. The
-        outputs of the d + 1 samples after an action follow from the actions so far.
+        The most samples in a block: d + 1, with d the shortest delay that can be drawn. The
+        temperatures of the d + 1 samples after an action follow from the actions so far.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
@@ -59,23 +79,26 @@ class TorchPlants:
         self._beta = tuple(parameters.b)
         shortest, self._longest = map(int, parameters.range_of("delay"))
         self.most_samples = shortest + 1
-        # The flows that terms of B still need, t/h, the oldest first.
+        # The applied flows that terms of the polynomial B still need, t/h, the oldest first.
         flows = self._longest + len(self._beta)
         self._flows = deque([self._zeros] * flows, flows)
-        # The outputs, degC. A needs as many outputs as A has coefficients from z^-1 on.
+        # The temperatures, degC. The polynomial A needs as many past temperatures as A has
+        # coefficients from z^-1 on.
         self._outputs = History(self._zeros, len(parameters.a) - 1)
 
     def reset(self, mask: Tensor, age: Tensor | int, rows_to_drop: int) -> None:
-        """Bring some plants to rest, with the numbers of the present episodes.
+        """Bring some plants to rest, with the plant numbers of the present episodes.
 
         Parameters
         ----------
         mask
-            The plants, shape (n,).
+            True for the plants to reset, shape (n,).
         age
-            The k of all plants, shape (n,), or one number for all; 0 for plants in the mask.
+            The sample k of all plants, shape (n,), or one number for all plants; 0 for plants
+            in the mask.
         rows_to_drop
-            How many samples at the end of the latest block are dropped.
+            How many samples at the end of the latest block are dropped, as the environment has
+            not returned them.
         """
         self._outputs.reset(mask, rows_to_drop)
         self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
@@ -84,7 +107,7 @@ class TorchPlants:
         numbers = PlantNumbers(**self._episodes.numbers)
         self._initial_factors = self._dynamics.factors(numbers, 0)
         if self._drifts:
-            # The factors at the start of the drifts, and the total change of the factors.
+            # Gain factor and time constant factor at k = 0, and their total change by drift.
             final_factors = self._dynamics.factors(numbers, self._drift_samples)
             self._drift = [
                 (self._zeros + initial, self._zeros + (final - initial))
@@ -93,7 +116,7 @@ class TorchPlants:
         self._update_dynamics(age)
 
     def _reset_actuator(self) -> None:
-        """Compute what `apply` needs of the actuator's numbers."""
+        """Compute what `apply` needs of limits and dead zone, after a reset changed both."""
         numbers = self._episodes.numbers
         u_min = numbers["u_min"]
         u_max = numbers["u_max"]
@@ -104,8 +127,8 @@ class TorchPlants:
         self._edge = least_effective(numbers["dead_zone"], u_min, u_max, rounding)
 
     def _reset_delays(self) -> None:
-        """Compute where the delayed flows of each plant lie in all flows, if delays differ."""
-        self._places: Tensor | None = None  # in the flattened flows
+        """Compute the indices of each plant's delayed flows in all flows, if delays differ."""
+        self._places: Tensor | None = None  # indices in the flattened flows
         delay = self._episodes.numbers["delay"]
         if isinstance(delay, Tensor):
             n = len(self._zeros)
@@ -115,7 +138,10 @@ class TorchPlants:
             self._places = (rows[:, None] + first_rows) * n + columns
 
     def _update_dynamics(self, age: Tensor | int) -> None:
-        """Compute gain and time constant at an age, samples, and the coefficients of (28)."""
+        """Compute gain, time constant and coefficients of the plants at the sample k = `age`.
+
+        `age` has the shape (n,), or is one number for all plants.
+        """
         self._factors: tuple[Number, ...] = self._initial_factors
         if self._drifts:
             if isinstance(age, Tensor):
@@ -128,9 +154,13 @@ class TorchPlants:
         self._alpha, self._scale, self._load_gain = coefficients
 
     def apply(self, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Apply a(k) of all plants, shape (n,), and return u(k) and u_a(k), t/h."""
+        """Apply the actions a(k) of all plants, shape (n,), and store the applied flows.
+
+        The results are the commanded flows u(k) and the applied flows u_a(k), t/h, shape (n,).
+        """
         u_min, u_max = self._limits
-        # Section 4, last formula: rounded as in NumPy in float64, faster in float32.
+        # Last formula of the paper's Section 4. In float64, rounding is that of NumPy; in
+        # float32, speed counts more.
         if actions.dtype == torch.float64:
             command = actions.add(1.0).mul_(self._half_range).add_(u_min)
         else:
@@ -142,26 +172,29 @@ class TorchPlants:
     def outputs(
         self, block: Block, noise: Tensor | None, load: Tensor | None
     ) -> tuple[Tensor, list[tuple[Number, ...]]]:
-        """Compute the outputs of a block, after the action before the block was applied.
+        """Compute the temperatures of a block, after the action before the block was applied.
 
         Parameters
         ----------
         block
-            The block, of at most `most_samples` samples.
+            The samples to compute, at most `most_samples`.
         noise, load
-            n and w, degC, shape (samples, n); None for a signal that is always 0.
+            Coloured noise n and load w of the block, degC, shape (samples, n); None for a
+            signal that is always 0.
 
         Returns
         -------
         Tensor
-            y, degC, shape (samples, n).
+            Temperatures y, degC, shape (samples, n).
         list of tuple
-            Gain and time constant at each sample, as multiples of those of A and B.
+            At each sample, the gain factor and the time constant factor, as multiples of gain
+            and time constant of the polynomials A and B.
         """
         outputs = [*self._outputs.rows]
         factors: list[tuple[Number, ...]] = []
         response = self._response(block.samples)
-        # The coefficients are constant from each of these rows to the next.
+        # The rows of the block at which coefficients change; between two changes, the
+        # coefficients are constant.
         changes = block.due_rows if self._drifts else []
         for first, end in pairwise(sorted({0, *changes, block.samples})):
             if first in changes:
@@ -184,12 +217,16 @@ class TorchPlants:
         return torch.stack(new_outputs), factors
 
     def detach(self) -> None:
-        """Cut the graph that leads to earlier actions."""
+        """Cut the gradient graph from past flows and temperatures to earlier actions."""
         self._outputs.detach()
         self._flows.extend([flow.detach() for flow in self._flows])
 
     def _response(self, samples: int) -> Tensor:
-        """Return the response to the flows, B of (28), shape (samples, n)."""
+        """Return the part of the temperatures that past flows cause, degC, shape (samples, n).
+
+        The part at sample k is B(z^-1) u_a(k-d), with the polynomial B of equation (28) of the
+        paper, applied flow u_a and delay d. `samples` is the number of samples in the block.
+        """
         needed = samples + len(self._beta) - 1
         if self._places is None:
             flows = torch.stack([*islice(self._flows, needed)])
@@ -206,7 +243,7 @@ class TorchPlants:
 
 
 def _add_product(first: Tensor, factor: Number, second: Tensor) -> Tensor:
-    """Return first + factor * second, in one operation."""
+    """Return first + factor * second in one operation of PyTorch, which is faster than two."""
     if isinstance(factor, Tensor):
         return torch.addcmul(first, factor, second)
     return torch.add(first, second, alpha=factor)

@@ -1,10 +1,10 @@
-"""Generate the external signals of many plants in PyTorch, from one generator.
+"""Generate the external signals of many plants in PyTorch, from one random number generator.
 
-A signal has two methods, which work on n plants at once, without a loop over plants.
-`next(block)` returns the samples of the next block, degC, shape (samples, n).
-`reset(mask, rows_to_drop)` begins an episode of the plants in the mask and returns the signal
-at k = 0, degC, shape (n,). The signal forgets the samples that the environment has not
-returned: the last `rows_to_drop` of the latest block.
+A signal class has two methods, which work on n plants at once, without a loop over plants.
+`next(block)` returns the samples of the next block, degC, shape (samples, n). `reset(mask,
+rows_to_drop)` begins an episode of the plants in the mask, and returns the signal at sample k =
+0, degC, shape (n,). `reset` also forgets the last `rows_to_drop` samples of the latest block,
+which the environment has computed, but not returned.
 """
 
 from collections.abc import Sequence
@@ -18,24 +18,39 @@ from mptc_gym.torch_episodes import Block, Episodes, External, History
 
 
 class Noise:
-    """Coloured noise, by name: see `mptc_gym.signals.Noise`."""
+    """The plant's noise or the transmitter's noise, for many plants; 0 at k = 0.
+
+    Parameters
+    ----------
+    name
+        "noise" for the coloured noise n(k) = C(z^-1) xi(k) of equation (28) of the paper, with
+        white noise xi; or "measurement_noise" for the noise of the transmitter.
+    c
+        The coefficients of C, from z^0 on.
+    episodes
+        The present episodes of the plants, which hold the variance and the generator.
+    """
 
     def __init__(self, name: str, c: Sequence[float], episodes: Episodes) -> None:
         self._variance_name = f"{name}_variance"
         self._c = c
         self._order = len(c) - 1
         self._episodes = episodes
-        # xi of the samples before the latest block that C needs, then xi of the block.
+        # The white noise xi, degC: the samples before the latest block that the polynomial C
+        # needs, and then the samples of the block.
         self._xi = episodes.zeros.expand(self._order, -1)
 
     def reset(self, mask: Tensor, rows_to_drop: int) -> Tensor:
-        """Begin an episode of some plants."""
+        """Begin an episode of the plants in `mask`, and return zeros, shape (n,).
+
+        The last `rows_to_drop` samples of the latest block are forgotten.
+        """
         self._deviation = self._episodes.numbers[self._variance_name] ** 0.5
         self._xi = self._xi[: len(self._xi) - rows_to_drop].masked_fill(mask, 0.0)
         return self._episodes.zeros
 
     def next(self, block: Block) -> Tensor:
-        """Draw the noise of a block."""
+        """Return the noise of the samples of a block, degC, shape (samples, n)."""
         order = self._order
         generator = self._episodes.generator
         past = self._xi[len(self._xi) - order :]
@@ -53,25 +68,36 @@ class Noise:
 
 
 class RandomSetPoint:
-    """A set point of random levels, each held for a random number of samples.
+    """A set point of random levels, each level held for a random number of samples.
 
-    The present level and the next one of each plant are known. The two are enough for a block,
-    as no block is longer than the shortest level. Times are counted in samples of this signal.
+    Of each plant, the present level and the next level are known. These two levels are enough
+    for a block, as no block is longer than the shortest level. Times are counted in samples of
+    this signal.
+
+    Parameters
+    ----------
+    levels
+        The ranges from which levels and their lengths are drawn.
+    episodes
+        The present episodes of the plants, which hold the random number generator.
     """
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
         self._distribution = levels
         self._episodes = episodes
         zeros = episodes.zeros
-        self._time = 0  # of the latest sample
-        self._known_until = 0  # the time up to which the two levels are enough
+        self._time = 0  # time of the latest sample
+        self._known_until = 0  # the time up to which the present and the next level are enough
         self._level = zeros  # present level of each plant, degC
-        self._next_level = zeros  # the level that follows it, degC
+        self._next_level = zeros  # the level after the present level, degC
         self._end = zeros.to(torch.int64)  # the time at which the present level ends
         self._next_end = self._end
 
     def reset(self, mask: Tensor, rows_to_drop: int) -> Tensor:
-        """Begin an episode of some plants."""
+        """Begin an episode of the plants in `mask`, and return set points, degC, shape (n,).
+
+        The last `rows_to_drop` samples of the latest block are forgotten.
+        """
         self._time -= rows_to_drop
         self._forget_past_levels()
         levels, lengths = self._draw()
@@ -81,7 +107,7 @@ class RandomSetPoint:
         return self._level
 
     def next(self, block: Block) -> Tensor:
-        """Return the set points of a block."""
+        """Return the set points of the samples of a block, degC, shape (samples, n)."""
         last_time = self._time + block.samples
         if last_time > self._known_until:
             self._forget_past_levels()
@@ -93,21 +119,29 @@ class RandomSetPoint:
         return torch.where(times[:, None] >= self._end, self._next_level, self._level)
 
     def _draw(self) -> tuple[Tensor, Tensor]:
-        """Draw levels, degC, and for how many samples the levels hold, each of shape (n,)."""
+        """Draw levels, degC, and their lengths in samples, each for all plants, shape (n,)."""
         distribution = self._distribution
         levels = self._episodes.draw_within_one(1)[0] * distribution.amplitude
         lengths = self._episodes.draw(distribution.shortest, distribution.longest, True)
         return levels, lengths.to(torch.int64)
 
     def _forget_past_levels(self) -> None:
-        """Move on to the next level of the plants whose present level has ended."""
+        """Make the next level the present level of each plant whose present level has ended."""
         has_ended = self._end <= self._time
         self._level = torch.where(has_ended, self._next_level, self._level)
         self._end = torch.where(has_ended, self._next_end, self._end)
 
 
 class RepeatedSetPoint:
-    """A set point that repeats a sequence of levels; see `mptc_gym.signals.Levels`."""
+    """A set point that repeats a sequence of levels, the same for all plants.
+
+    Parameters
+    ----------
+    levels
+        The levels, degC, and for how many samples each level holds.
+    episodes
+        The present episodes of the plants.
+    """
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
         self._n = len(episodes.zeros)
@@ -116,33 +150,48 @@ class RepeatedSetPoint:
         self._period = sum(levels.lengths)
 
     def reset(self, mask: Tensor, rows_to_drop: int) -> Tensor:
-        """Begin an episode of some plants."""
+        """Return the first level of the set point for all plants, degC, shape (n,).
+
+        `mask` and `rows_to_drop`, arguments of every signal, are not needed: `next` computes
+        set points from the sample k alone.
+        """
         return self._values[0].expand(self._n)
 
     def next(self, block: Block) -> Tensor:
-        """Return the set points of a block."""
+        """Return the set points of the samples of a block, degC, shape (samples, n)."""
         ages = block.ages(self._ends.device)
         places = torch.bucketize(ages % self._period, self._ends, right=True)
         return self._values[places].expand(-1, self._n)
 
 
 class Disturbance:
-    """The load disturbance, steps and a walk: see `mptc_gym.signals.Disturbance`."""
+    """The load disturbance w(k), degC, of many plants: the sum of steps and a random walk.
+
+    The distribution of the load is that of `mptc_gym.signals.Disturbance`.
+
+    Parameters
+    ----------
+    episodes
+        The present episodes of the plants, which hold plant numbers and generator.
+    """
 
     def __init__(self, episodes: Episodes) -> None:
         self._episodes = episodes
-        # The two parts of the load, degC.
+        # The two parts of the load, steps and walk, degC.
         self._steps = History(episodes.zeros, 1)
         self._walk = History(episodes.zeros, 1)
 
     def reset(self, mask: Tensor, rows_to_drop: int) -> Tensor:
-        """Begin an episode of some plants."""
+        """Begin an episode of the plants in `mask` with a load of 0; return zeros, shape (n,).
+
+        The last `rows_to_drop` samples of the latest block are forgotten.
+        """
         self._steps.reset(mask, rows_to_drop)
         self._walk.reset(mask, rows_to_drop)
         return self._episodes.zeros
 
     def next(self, block: Block) -> Tensor:
-        """Draw the load of a block."""
+        """Return the load at the samples of a block, degC, shape (samples, n)."""
         step = self._steps.rows[-1]
         walk = self._walk.rows[-1]
         steps: list[Tensor] = []
@@ -159,7 +208,13 @@ class Disturbance:
     def _change(self, step: Tensor, walk: Tensor, age: Tensor | int) -> tuple[Tensor, Tensor]:
         """Return the next values of the two parts of the load, degC, each of shape (n,).
 
-        The load changes where the age, in samples, is a multiple of `LOAD_INTERVAL`.
+        Parameters
+        ----------
+        step, walk
+            The present values of the sum of steps and of the random walk, degC, shape (n,).
+        age
+            The sample k of each plant, shape (n,), or one number for all plants. The load of a
+            plant changes only if k is a multiple of `LOAD_INTERVAL`.
         """
         numbers = self._episodes.numbers
         step_draws, walk_draws = self._episodes.draw_within_one(2)
@@ -168,13 +223,14 @@ class Disturbance:
             interval = interval.clamp(min=LOAD_INTERVAL)
         else:
             interval = max(interval, LOAD_INTERVAL)
-        # A step occurs if this number is within +-1, and the number is then uniform there.
+        # A step occurs if `position` is within +-1; given a step, `position` is uniform within
+        # +-1, and so places the new level.
         position = step_draws * (interval / LOAD_INTERVAL)
         jumps = position.abs() <= 1.0
-        # Uniform within +-h, a step of the walk has the variance h^2 / 3.
+        # A step of the walk is uniform within +-h and so has the variance h^2 / 3.
         width = (3.0 * LOAD_INTERVAL * numbers["disturbance_walk_variance"]) ** 0.5
         next_walk = walk + walk_draws * width
-        if isinstance(age, Tensor):  # plants of different ages
+        if isinstance(age, Tensor):  # the episodes of the plants began at different times
             is_due = age % LOAD_INTERVAL == 0
             jumps &= is_due
             next_walk = torch.where(is_due, next_walk, walk)
@@ -186,7 +242,11 @@ Signal = Noise | RandomSetPoint | RepeatedSetPoint | Disturbance | External
 
 
 def make_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
-    """Return the signals of an environment by name, except noise that is always 0."""
+    """Return the signals of an environment by name, except noise and load that are always 0.
+
+    `parameters` are the arguments of the environment, and `episodes` the present episodes of
+    its plants.
+    """
     levels = Levels(parameters)
     setpoint = RandomSetPoint if levels.random else RepeatedSetPoint
     signals: dict[str, Signal] = {"setpoint": setpoint(levels, episodes)}

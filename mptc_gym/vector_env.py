@@ -24,16 +24,19 @@ from mptc_gym.signals import BLOCK, Indices, Signals, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 
-NOISE_BYTES = 1 << 27  # largest block of noise, unless a single sample of all plants takes more
-STEPS_PER_SHIFT = 64  # steps after which the window of observations is moved back
+# Most bytes for a block of noise, 128 MiB, unless a single sample of all plants takes more.
+NOISE_BYTES = 1 << 27
+# Steps after which the observations are moved back in memory: rare moves take little time, and
+# 64 further elements take little memory.
+STEPS_PER_SHIFT = 64
 
 
 class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects the bases
     """n plants that advance together: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
 
-    Given the same seed, `reset` and `step` return bit for bit the same as Gymnasium's
-    `SyncVectorEnv` of n `MiddlePointEnv`. See `MiddlePointEnv` for the plant, the spaces, the
-    reward, the infos and the arguments.
+    With the same seed, `reset` and `step` of `MiddlePointVectorEnv` and of Gymnasium's
+    `SyncVectorEnv` of n `MiddlePointEnv` return the same, bit for bit. See `MiddlePointEnv` for
+    the plant, the spaces, the reward, the infos and the arguments.
 
     Parameters
     ----------
@@ -62,17 +65,19 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
     Notes
     -----
-    `reset(seed=seed)` restarts the random streams of plant i with seed + i, or with element i
-    if the seed is a list. Without a seed, or where the list holds None, the next episode of the
-    present streams begins. Rewards are float64, and observations float32.
+    `reset(seed=seed)` restarts the random number streams of plant i with seed + i, or with
+    element i of the seed if the seed is a list. Without a seed, or where the list holds None,
+    the next episode of the plant's present streams begins. Rewards are float64, and
+    observations float32.
 
     All plants share one clock, so that a step is array arithmetic alone. There is a Python loop
     over plants only where every plant draws from its own generators: at the start of an
     episode, once every 600 samples or so of noise, and when a random set point changes. The
     memory that a plant needs, a few KiB, does not grow with the length of an episode.
 
-    With an unstable `a`, or with actions beyond 1e154, y may overflow. NumPy then warns here,
-    while `MiddlePointEnv` continues without a warning.
+    With an unstable `a`, or with actions beyond 1e154, the temperature may overflow. NumPy
+    warns of an overflow in `MiddlePointVectorEnv`, while `MiddlePointEnv` continues without a
+    warning.
     """
 
     metadata: dict[str, Any] = MiddlePointEnv.metadata | {"render_modes": ["rgb_array"]}
@@ -91,19 +96,20 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
         parameters = self.parameters
         self.render_mode = render_mode
-        # Streams and, for pictures, records by the index of the plant, from the first reset on.
+        # Random number streams and, if pictures are wanted, records of episodes, by the index
+        # of the plant. Both dicts are empty before the first reset.
         self._streams: dict[int, Streams] = {}
         self._records: dict[int, Record] = {}
         self._seeds: list[int | None] = [None] * num_envs
         self._ranges = Ranges(parameters)
-        # Blocks of noise end with an episode. Where many plants would need much memory, the
-        # blocks are shorter, which is slower.
+        # Blocks of noise end with an episode, so that no noise is generated in vain. Where many
+        # plants would need much memory, the blocks are shorter, which is slower.
         longest = max(1, min(BLOCK, NOISE_BYTES // (8 * num_envs)))
         block = math.ceil(self._limit / math.ceil(self._limit / longest))
         self._signals = Signals.of(parameters, num_envs, block)
         self._plants = PlantBatch(parameters, num_envs)
         self._window = _Window(parameters.windows, num_envs)
-        self._actions = np.zeros(num_envs)  # of the last step
+        self._actions = np.zeros(num_envs)  # the actions of the last step
         # In comparisons, an array of full length is faster than a number; in other arithmetic,
         # an array of one number is faster.
         self._zeros = np.zeros(num_envs)
@@ -119,13 +125,20 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """The seed of each plant; None for each plant before the first reset."""
+        """The seed of each plant's random number streams; None before the first reset."""
         return tuple(self._seeds)
 
     def render(self) -> tuple[Frame, ...] | None:
-        """Return a picture of each plant, shape (540, 960, 3); see `MiddlePointEnv.render`.
+        """Return a picture of each plant, uint8, shape (540, 960, 3): rows, columns, RGB.
 
-        Without a render mode, return None, after a warning.
+        Without a render mode, the result is None, after a warning.
+
+        Raises
+        ------
+        ResetNeeded
+            If `render` is called before the first `reset`.
+        DependencyNotInstalled
+            If pygame is not installed.
         """
         if self.render_mode is None:
             logger.warn(NO_MODE)
@@ -137,8 +150,12 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return tuple(map(drawing.frame, self._records.values()))
 
     def _advance(self, a: Values) -> tuple[Observations, Values, Mask, Mask, Infos]:
-        # The speed of the environment depends on this method: for few plants, on its number of
-        # calls.
+        """Move all plants by one sample, and return what `step` returns if no episode ends.
+
+        `a` are the checked actions, shape (num_envs,).
+        """
+        # The speed of the environment depends on this method. With few plants, the number of
+        # NumPy calls in this method counts.
         signals = self._signals
         setpoint = signals.setpoint.next()
         noise = self._zeros
@@ -153,7 +170,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         error_scale, minus_half, quadratic, move_weight = self._reward_terms
         scaled = error / error_scale
         if quadratic:
-            rewards = scaled * scaled  # (12)
+            rewards = scaled * scaled  # the paper's cost, equation (12)
             rewards *= minus_half
         else:
             rewards = -np.abs(scaled)
@@ -167,9 +184,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             measured = output + signals.measurement_noise.next()
             measured_error = setpoint - measured
         lowest, highest, squared_span = self._span
-        # If the sum of squares is at most the span squared, no reading is beyond the span.
+        # If the sum of the squared readings is at most the squared span of the transmitter, no
+        # reading is beyond the span.
         if not measured.dot(measured) <= squared_span:
-            measured = np.fmin(measured, highest)  # which turns NaN into the limit
+            measured = np.fmin(measured, highest)  # fmin turns NaN into the highest reading
             np.fmax(measured, lowest, out=measured)
             measured_error = setpoint - measured
         observations = self._window.add(setpoint, measured_error, measured, a)
@@ -179,7 +197,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
                 self._records[i].add(*sample)
 
         mask = self._all_true.copy()
-        infos = {  # written out, which is fastest
+        infos = {  # written out entry by entry, which is faster than a loop
             "output": output.copy(),
             "_output": mask,
             "setpoint": setpoint.copy(),
@@ -202,6 +220,11 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return observations, rewards, self._all_false.copy(), self._all_false.copy(), infos
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
+        """Begin an episode of the plants in the mask; return the infos at k = 0 that are not 0.
+
+        The infos are arrays of shape (num_envs,); elements of plants outside the mask have no
+        meaning.
+        """
         which = np.flatnonzero(mask)
         numbers = self._ranges.draw([self._streams[i] for i in which.tolist()])
         self._plants.reset(which, numbers)
@@ -224,21 +247,33 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return infos
 
     def _final(self, ended: Mask, observations: Observations) -> NDArray[np.object_]:
+        """Return the last observation of each plant whose episode has just ended, else None.
+
+        `ended` is True for these plants, and the result is an array of objects; both have the
+        shape (num_envs,). `observations` has the shape (num_envs, size).
+        """
         final_observations = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(ended):
             final_observations[i] = observations[i].copy()
         return final_observations
 
     def _as_array(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return a copy of a mask or of integers, shape (num_envs,)."""
         return values.copy()
 
     def _hidden_state(self) -> tuple[dict[str, Values], Values]:
+        """Return the drawn plant numbers by name, and the load w, degC, for `plant_state`."""
         load = self._zeros
         if self._signals.disturbance is not None:
             load = self._signals.disturbance.present
         return self._plants.numbers.chosen(self.parameters.ranges), load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
+        """Start new random number streams for plants in `mask` that get a seed from `reset`.
+
+        A ValueError is raised if the seed is neither None, nor an integer, nor a list with an
+        integer or None for each plant. The options need no preparation.
+        """
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():
             seed_of_plant = seeds[i]
@@ -249,7 +284,11 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
                 self._streams[i] = Streams.of_seed(int(seed_of_plant))
 
     def _checked_seeds(self, seed: Any) -> Sequence[Any]:
-        """Return the seed of each plant, which is None for plants whose streams continue."""
+        """Return the seed of each plant, with None for plants whose random streams continue.
+
+        `seed` is None, one integer for plant 0, from which plant i has `seed` + i, or a list
+        with an integer or None for each plant. Another value raises a ValueError.
+        """
         n = self.num_envs
         if seed is None:
             return [None] * n
@@ -263,22 +302,33 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return list(seeds)
 
     def _checked_actions(self, actions: Any) -> Values:
+        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended.
+
+        A ValueError is raised if the actions are not finite numbers of the shape (num_envs, 1).
+        """
         return many_actions(actions, self.num_envs, self._ended)
 
 
 class _Window:
-    """The observations of all plants.
+    """The observations of all plants, in memory such that a new sample takes little copying.
 
-    An observation has four blocks: set points, errors, outputs and actions, each with the
-    newest first; `windows` are the sizes of these blocks. The observations lie one after
-    another in a row of memory, from a place that moves back by one element at each step. So the
-    samples of all blocks shift by one without being copied, and only the first element of each
-    block has to be written.
+    An observation has four blocks: set points, errors, outputs and past actions, each with the
+    newest sample first. The observations lie one after another in a row of memory, from a place
+    that moves back by one element at each step. So the samples of all blocks shift by one
+    without being copied, and only the first element of each block has to be written.
+
+    Parameters
+    ----------
+    windows
+        The sizes of the four blocks of an observation, samples.
+    num_envs
+        Number n of plants.
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
         heads = np.cumsum([0, *windows[:-1]]).tolist()
-        # Indices of the newest sample of a block in all observations; None for an empty block.
+        # Indices of the newest sample of each block in all observations; None for a block of
+        # size 0.
         self._setpoints, self._errors, self._outputs, self._actions = (
             np.s_[:, head] if window else None
             for head, window in zip(heads, windows, strict=True)
@@ -287,20 +337,28 @@ class _Window:
         self._shape = num_envs, sum(windows)
         self._elements = num_envs * sum(windows)
         self._row = np.zeros(self._elements + STEPS_PER_SHIFT, np.float32)
-        self._place = STEPS_PER_SHIFT  # of the first observation in the row
+        self._place = STEPS_PER_SHIFT  # index in the row at which the first observation begins
 
     def present(self) -> Observations:
         """Return a copy of the present observations, shape (n, size)."""
         return self._view().copy()
 
     def _view(self) -> Observations:
+        """Return the present observations, shape (n, size), without copying them."""
         return self._row[self._place : self._place + self._elements].reshape(self._shape)
 
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
         """Begin an episode of some plants at rest.
 
-        `which` are the indices of these plants, `setpoint` is y_d(0), degC, and `rest_action`
-        is the action for u = 0; both have the shape (len(which),), or () for all plants.
+        Parameters
+        ----------
+        which
+            The indices of these plants.
+        setpoint
+            Set points y_d(0), degC, shape (len(which),).
+        rest_action
+            Actions for a flow of 0 t/h, shape (len(which),), or () for one action for all
+            plants.
         """
         observations = np.zeros((len(which), self._shape[1]), np.float32)
         observations[self._all_actions] = np.reshape(np.clip(rest_action, -1.0, 1.0), (-1, 1))
@@ -313,9 +371,10 @@ class _Window:
     def add(
         self, setpoint: Values, error: Values, output: Values, action: Values
     ) -> Observations:
-        """Add a sample of all plants, and return the observations, shape (n, size).
+        """Add a sample of all plants, and return a copy of the observations, shape (n, size).
 
-        The arguments have the shape (n,): y_d, the measured error and output, degC, and a.
+        The four arguments have the shape (n,): set points y_d(k+1), measured errors and
+        measured outputs, degC, and the normalised actions a(k).
         """
         if self._place == 0:
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]

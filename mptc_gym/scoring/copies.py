@@ -1,8 +1,9 @@
 """Copy environments layer by layer, so that a policy can act in a copy.
 
-`copy.deepcopy` alone is not enough. It fails for files and for most wrappers of
-Stable-Baselines3, loses what a `VecNormalize` wraps, and closes the pipes of environments in
-other processes.
+A layer is one environment object in a nesting: a wrapper, a vector environment or an innermost
+environment. `copy.deepcopy` alone is not enough: this function fails for files and for most
+wrappers of Stable-Baselines3, loses what a `VecNormalize` wraps, and closes the pipes of
+environments in other processes.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ from gymnasium.vector import VectorEnv
 
 from mptc_gym.layers import INNER, VEC_ENV, inner_environments, layers, loaded, runs_processes
 
-# Layers that record episodes and change nothing: a copy is made without these layers.
+# The classes of layers that record episodes and change neither observations nor actions: a copy
+# of an environment is made without these layers.
 _RECORDERS: Final = (
     "gymnasium.wrappers.RecordVideo",
     "gymnasium.wrappers.vector.RecordVideo",
     "minari.DataCollector",
     f"{VEC_ENV}.VecVideoRecorder",
 )
-# The ends of pipes; on Windows, some are of a class that other systems do not have.
+# The classes of the ends of pipes; on Windows, some ends are of a class that other systems
+# lack.
 _PIPES: Final[tuple[Any, ...]] = (
     connection.Connection,
     getattr(connection, "PipeConnection", connection.Connection),
@@ -33,11 +36,11 @@ _PIPES: Final[tuple[Any, ...]] = (
 
 
 class Copy:
-    """A copy of an environment and of all that it wraps, also in mid-episode.
+    """A copy of an environment and all environments within, also in mid-episode.
 
-    The original stays as it is. The copy writes to no file of the original, and closes nothing.
-    The copy shares layers with the original that run in other processes, show a window, hold a
-    pipe, or cannot be copied for another reason.
+    The original environment stays as it is. The copy writes to no file of the original, and
+    closes nothing. Layers that run in other processes, show a window, hold a pipe, or cannot be
+    copied for another reason are not copied: copy and original share these layers.
 
     Parameters
     ----------
@@ -49,7 +52,7 @@ class Copy:
     env : environment
         The copy.
     shared : dict of int to environment
-        The layers of the original that the copy shares, by `id`.
+        The layers that copy and original share, by Python's `id` of the layer.
     reason : str
         Why a layer cannot be copied; "" if all layers were copied.
     """
@@ -62,7 +65,7 @@ class Copy:
             self.env = self._copy(env)
 
     def _copy(self, layer: Any) -> Any:
-        """Return a copy of a layer and of the layers within it, or else the layer itself."""
+        """Return a copy of a layer and its inner layers, or the layer if that is impossible."""
         if id(layer) in self._memo:
             return self._memo[id(layer)]
         for inner in inner_environments(layer):
@@ -74,7 +77,7 @@ class Copy:
                 return _copy_layer(layer, self._memo)
             except Exception as error:  # whatever a layer of another package raises
                 reason = f"{type(layer).__name__} cannot be copied: {error}"
-                self._memo.clear()  # of parts of the copy that failed
+                self._memo.clear()  # forget the parts of the copy that failed
                 self._memo.update(memo_before)
         self.reason = reason
         for original in layers(layer):
@@ -85,9 +88,9 @@ class Copy:
 
 @contextmanager
 def _pipes_refused() -> Iterator[None]:
-    """Return a context in which the copy of a pipe is a TypeError.
+    """Return a context in which copying the end of a pipe raises a TypeError.
 
-    Otherwise, the copy of a pipe closes the original when the copy is deleted.
+    Without the context, the copy of a pipe closes the original pipe when the copy is deleted.
     """
     before = dict(copyreg.dispatch_table)
     for pipe in _PIPES:
@@ -101,25 +104,29 @@ def _pipes_refused() -> Iterator[None]:
 
 
 def _refuse_pipe(_: Any) -> NoReturn:
-    """Raise a TypeError in place of a copy of a pipe."""
+    """Raise a TypeError, in place of copying the end of a pipe."""
     raise TypeError("a pipe to another process cannot be copied")
 
 
 def _why_not(layer: Any) -> str:
-    """Return why a copy of a layer must not even be tried; "" if it may be tried."""
+    """Return why a layer must not be copied; "" if a copy may be tried."""
     name = type(layer).__name__
     if runs_processes(layer):
         return f"{name} runs in other processes"
     inner = inner_environments(layer)
     inner_modes = [getattr(environment, "render_mode", None) for environment in inner]
-    # A wrapper has the mode of the environment that shows the window.
+    # A wrapper around an environment that shows a window also has the render mode "human".
     if getattr(layer, "render_mode", None) == "human" and "human" not in inner_modes:
         return f"{name} shows a window"
     return ""
 
 
 def _copy_layer(layer: Any, memo: dict[int, Any]) -> Any:
-    """Return a copy of a layer, whose inner layers are copied and in the memo already."""
+    """Return a copy of a layer whose inner layers have been copied before.
+
+    `memo` holds the copies so far by the `id` of the originals, as for `copy.deepcopy`. If the
+    layer only records episodes, the copy of the layer within it is returned.
+    """
     if isinstance(layer, tuple(map(loaded, _RECORDERS))):
         (inner,) = inner_environments(layer)
         memo[id(layer)] = memo[id(inner)]

@@ -1,4 +1,8 @@
-"""Refuse environments that a policy was not made for, as far as the policy can tell."""
+"""Refuse environments that a policy was not trained or made for, as far as is known.
+
+A model of Stable-Baselines3 and a controller in `agents` know something of their environments;
+a function knows nothing.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,7 @@ from mptc_gym.layers import (
 from mptc_gym.scoring.opening import Plants
 from mptc_gym.scoring.policies import form_of
 
+# The classes of the models of Stable-Baselines3, which know the spaces of their training.
 _MODELS: Final = (
     "stable_baselines3.common.base_class.BaseAlgorithm",
     "stable_baselines3.common.policies.BaseModel",
@@ -28,11 +33,19 @@ _MODELS: Final = (
 def check_fit(policy: Any, plants: Plants) -> None:
     """Raise a ValueError if a policy cannot be scored in these plants.
 
-    Wrappers that normalise must have the statistics of a training, and must not run in other
-    processes. A policy with a method `check_environment`, such as a controller in `agents`,
-    checks the plants itself. For a model of Stable-Baselines3, the plants must have the spaces
-    of its training and, as long as the model has the environments of its training, the windows
-    and wrappers of these environments.
+    Wrappers that normalise observations must have the statistics of a training, and must not
+    run in other processes. A policy with a method `check_environment`, such as a controller in
+    `agents`, checks the plants by this method. For a model of Stable-Baselines3, the plants
+    must have the observation and action spaces of the model's training. If the model still has
+    the environments of the training, the plants must also have the windows and wrappers of
+    these environments.
+
+    Parameters
+    ----------
+    policy
+        A policy, as in `mptc_gym.evaluate`.
+    plants
+        A vector environment of Gymnasium in which the policy is to act.
     """
     for layer in layers(plants):
         if runs_processes(layer):
@@ -50,7 +63,7 @@ def check_fit(policy: Any, plants: Plants) -> None:
         return
     training = getattr(model, "env", None)
     groups_of_training = plant_groups(training) if is_environment(training) else []
-    if groups_of_training:  # closed processes have none
+    if groups_of_training:  # the list is empty if the training's processes are closed
         _compare(
             "windows (set points, errors, outputs, actions)",
             {group.parameters.windows for group in groups_of_training},
@@ -67,7 +80,10 @@ def check_fit(policy: Any, plants: Plants) -> None:
 
 
 def _check_processes(layer: Any) -> None:
-    """Raise a ValueError if a wrapper of Gymnasium normalises in other processes."""
+    """Raise a ValueError if a wrapper of Gymnasium normalises in other processes.
+
+    `layer` is a vector environment that runs its environments in other processes.
+    """
     if any(ask_processes(layer, "has_wrapper_attr", "update_running_mean")):
         raise ValueError(
             "env must not normalise in other processes, where statistics cannot be kept from "
@@ -76,7 +92,11 @@ def _check_processes(layer: Any) -> None:
 
 
 def _check_statistics(layer: Any) -> None:
-    """Raise a ValueError if a wrapper normalises observations by its initial statistics."""
+    """Raise a ValueError if a wrapper normalises observations by initial statistics.
+
+    `layer` is a wrapper that normalises. Statistics with mean 0 and variance 1 count as
+    initial: no training has updated these statistics.
+    """
     statistics = vars(layer).get("obs_rms", {})
     parts = statistics.values() if isinstance(statistics, dict) else [statistics]
     for part in parts:
@@ -90,8 +110,13 @@ def _check_statistics(layer: Any) -> None:
 def _compare(what: str, of_training: Collection[Any], of_env: Collection[Any]) -> None:
     """Raise a ValueError if environments differ from those of a model's training.
 
-    `of_training` and `of_env` are collections of the same type: of windows, of wrappers, or of
-    one space.
+    Parameters
+    ----------
+    what
+        What is compared, for the message.
+    of_training, of_env
+        What the training has, and what the environments have: both a set of windows, both a set
+        of wrapper names, or both a list with one space.
     """
     if of_training == of_env:
         return
@@ -105,7 +130,7 @@ def _compare(what: str, of_training: Collection[Any], of_env: Collection[Any]) -
 
 
 def _in_words(value: Any) -> str:
-    """Return a value as text; of a `Box`, its shape and the range of its bounds."""
+    """Return a value as text for a message: of a `Box`, the shape and the extreme bounds."""
     if not isinstance(value, Box):
         return str(value)
     return f"shape {value.shape} within {value.low.min():g} to {value.high.max():g}"

@@ -1,4 +1,8 @@
-"""Open environments of any kind as one vector environment of Gymnasium to act in."""
+"""Open environments of any kind as one vector environment of Gymnasium to act in.
+
+Environments of any kind are an id, a spec (`EnvSpec`), a function that makes an environment,
+and environments of Gymnasium or Stable-Baselines3.
+"""
 
 from __future__ import annotations
 
@@ -27,16 +31,17 @@ Plants = Any
 
 @contextmanager
 def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plants]:
-    """Open a vector environment for a policy to act in.
+    """Return a context with a vector environment for a policy to act in.
 
-    While it is open, wrappers that normalise do not update their statistics.
+    In the context, wrappers that normalise do not update their statistics.
 
     Parameters
     ----------
     env
-        As in `mptc_gym.evaluate`. The policy acts in a copy of environments that are handed
-        over. Environments that cannot be copied act themselves, and begin a new episode
-        afterwards. Environments that are made here are closed afterwards.
+        As in `mptc_gym.evaluate`. If `env` is an environment, the vector environment holds a
+        copy of this environment. Environments that cannot be copied are used themselves, and
+        begin a new episode at the end of the context. If `env` is an id, a spec or a function,
+        the environments that are made are closed at the end of the context.
     n
         Number of plants to make, if `env` is an id, a spec or a function.
     policy
@@ -53,7 +58,7 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
     ------
     ValueError
         If `env` or `policy` is of another kind; if `env` holds no plants of this package in
-        NumPy; or if it cannot be copied and is the environment in which `policy` trains.
+        NumPy; or if `env` cannot be copied and is the environment in which `policy` trains.
     """
     target = form_of(policy).target
     if arguments and not isinstance(env, str | EnvSpec):
@@ -61,7 +66,7 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
             f"{', '.join(arguments)} must be given where env is made: evaluate takes arguments "
             "of the plant only with an id or a spec"
         )
-    with ExitStack() as stack:  # which undoes all in the reverse order
+    with ExitStack() as stack:  # which undoes all steps of opening, the last step first
         if is_environment(env):
             copy = Copy(env)
             _refuse_training_environments(copy, target)
@@ -74,7 +79,7 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
         if not plant_groups(plants):
             allowed = "of MiddlePointEnv in NumPy, and open, such as an id or a spec of it"
             reject("env", env, allowed)
-        if acts_itself:  # within the copies of wrappers that can be copied
+        if acts_itself:  # the originals of some layers act, within copies of other layers
             stack.enter_context(_frozen(env))
             stack.callback(_as_vector(env).reset, seed=_next_seeds(plants))
         stack.enter_context(_frozen(plants))
@@ -82,7 +87,11 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
 
 
 def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
-    """Make n plants from an id or a spec, or by n calls of a function."""
+    """Return n plants from an id or a spec, or from n calls of a function, as one environment.
+
+    `env` is the id, the spec or the function, and `arguments` are further arguments of an id or
+    a spec. A ValueError is raised if no environments can be made.
+    """
     if isinstance(env, str | EnvSpec):
         single = make_one(env, arguments)
         batch = make_batch(single, n)
@@ -101,41 +110,59 @@ def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
 
 
 def _in_turn(environments: list[Env]) -> Plants:
-    """Return a vector environment that steps environments one after another."""
+    """Return a vector environment that steps the given environments one after another."""
     return SyncVectorEnv([lambda env=env: env for env in environments])  # type: ignore[misc]
 
 
 def _as_vector(env: Any) -> Plants:
-    """Return environments of any kind as a vector environment of Gymnasium."""
+    """Return an environment of any kind, as a vector environment of Gymnasium.
+
+    `env` is a single environment, a vector environment of Gymnasium, or a `VecEnv` of
+    Stable-Baselines3.
+    """
     if isinstance(env, VectorEnv):
         return env
     if not isinstance(env, gymnasium.Env):
         return _FromVecEnv(env)
     plants = _in_turn([env])
-    plants.closed = True  # as some versions of Gymnasium close what a deleted one holds
+    # Some versions of Gymnasium close the environments within a vector environment when the
+    # vector environment is deleted, unless it is closed.
+    plants.closed = True
     return plants
 
 
 class _FromVecEnv(VectorEnv[Any, Any, Any]):
-    """A `VecEnv` of Stable-Baselines3 as a vector environment of Gymnasium."""
+    """A `VecEnv` of Stable-Baselines3 as a vector environment of Gymnasium.
+
+    Parameters
+    ----------
+    venv
+        The `VecEnv`.
+    """
 
     def __init__(self, venv: Any) -> None:
         self.venv = venv
         self.num_envs = venv.num_envs
         self.single_observation_space = venv.observation_space
         self.single_action_space = venv.action_space
-        self.closed = True  # as only the user closes environments that are handed over
+        self.closed = True  # so that only the user closes the environments of the user
 
     @property
     def np_random_seed(self) -> Any:
-        """The latest seed of each plant, in a list."""
+        """The latest seed of each plant, in a list, as each environment reports its seed."""
         return self.venv.get_attr("np_random_seed")
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Reset all plants, and return observations and infos.
+        """Reset all plants, and return observations and infos, both in arrays.
 
-        Only a `GymnasiumVecEnv` takes a seed for each plant. Another `VecEnv` takes the first
-        seed, and gives the following integers to the other plants.
+        Parameters
+        ----------
+        seed
+            A list with a seed for each plant. Only a `GymnasiumVecEnv` takes all seeds. Another
+            `VecEnv` takes the first seed, and gives the integers that follow the first seed to
+            the other plants.
+        options
+            Not used.
         """
         innermost = self.venv.unwrapped
         if hasattr(innermost, "set_seeds"):
@@ -146,7 +173,11 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
         return observations, {**in_columns(innermost.reset_infos)}
 
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all plants, and return observations, rewards, flags and infos."""
+        """Step all plants, and return observations, rewards, flags and infos, all in arrays.
+
+        `actions` has one row for each plant. The flags say which episodes have ended; all ended
+        episodes count as terminated.
+        """
         observations, rewards, ended, infos = self.venv.step(actions)
         # A `GymnasiumVecEnv` fills its list of infos only where episodes end.
         columns = in_columns(infos) or getattr(self.venv.unwrapped, "infos", {})
@@ -173,13 +204,13 @@ def _refuse_training_environments(copy: Copy, target: Any) -> None:
 
 
 def _next_seeds(plants: Plants) -> list[int]:
-    """Return seeds of new episodes, which follow from the seeds of the present episodes.
+    """Return a seed for a new episode of each plant, computed from the present seeds.
 
     With these seeds, the environments of a user do not go on with the episodes of a score, and
     a user who seeds the environments can repeat a program.
     """
     present = np.ravel(plants.unwrapped.np_random_seed).tolist()
-    # Gymnasium has a negative number for a seed that it does not know.
+    # A negative number is Gymnasium's value for a seed that Gymnasium does not know.
     entropy = [abs(seed) for seed in present if seed is not None]
     seeds: list[int] = np.random.SeedSequence(entropy).generate_state(plants.num_envs).tolist()
     return seeds
@@ -187,7 +218,7 @@ def _next_seeds(plants: Plants) -> list[int]:
 
 @contextmanager
 def _frozen(env: Any) -> Iterator[None]:
-    """Keep the wrappers of an environment from updating their statistics for a while."""
+    """Return a context in which no wrapper of an environment updates its statistics."""
     with ExitStack() as stack:
         for layer in layers(env):
             flag = normaliser_flag(layer)

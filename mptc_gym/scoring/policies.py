@@ -1,8 +1,8 @@
 """Call a policy in any of its four forms as a function of observations.
 
 A policy is an object with `predict`, as in Stable-Baselines3; an object with `act`; a
-`torch.nn.Module`; or a function of NumPy arrays. A bound `predict` or `act` stands for its
-object, and a `functools.partial` for its function.
+`torch.nn.Module`; or a function of NumPy arrays. A bound method `predict` or `act` stands for
+the object of the method, and a `functools.partial` for the function within the partial.
 """
 
 from __future__ import annotations
@@ -19,25 +19,32 @@ import numpy as np
 from mptc_gym.checks import reject
 from mptc_gym.layers import is_environment, loaded
 
-# Takes observations, one row for each plant, and returns actions, one row for each plant.
+# A function of observations, one row for each plant, that returns actions, one row for each
+# plant.
 Act = Callable[[Any], Any]
-# Methods that make an object a policy. The first one that an object has is called.
+# Methods that make an object a policy. If an object has both methods, the first one is called.
 _METHODS: Final = ("predict", "act")
-# Held while a module is called, as several threads may call it and change its mode.
+# Held while a PyTorch module is called: several threads may call the module and change whether
+# the module is in evaluation mode.
 _LOCK: Final = threading.RLock()
 
 
 class Form(NamedTuple):
-    """How a policy is called."""
+    """How a policy is called, and on which object."""
 
-    function: Callable[..., Any]  # what is called with observations
+    function: Callable[..., Any]  # the function to call with observations
     method: str  # "predict", "act", or "" if the policy itself is the function
-    target: Any  # the object that the policy is, or whose `predict` or `act` it is
-    module: Any  # the torch.nn.Module that the policy is or whose method it is, or None
+    target: Any  # the object that the policy is, or whose `predict` or `act` the policy is
+    # The torch.nn.Module that the policy is, or whose method the policy is; otherwise None.
+    module: Any
 
 
 def form_of(policy: Any) -> Form:
-    """Return how a policy is called; raise a ValueError if it has none of the four forms."""
+    """Return how a policy is called, and on which object.
+
+    A ValueError is raised if the policy has none of the four forms: an object with `predict`,
+    an object with `act`, a `torch.nn.Module`, or a function.
+    """
     if is_environment(policy):
         reject("policy", policy, "a policy, which comes first: evaluate(policy, env)")
     if isinstance(policy, type):
@@ -65,17 +72,17 @@ def start(policy: Any, n: int) -> Act:
     Parameters
     ----------
     policy
-        A policy in one of the four forms. If it is an object with a method `reset`, or the
-        bound `predict` or `act` of such an object, `reset()` is called. For a method of another
-        name, `reset()` of its object is not called.
+        A policy in one of the four forms. If the policy is an object with a method `reset`, or
+        the bound method `predict` or `act` of an object with `reset`, `reset()` is called. If
+        the policy is a bound method of another name, `reset()` of the object is not called.
     n
         Number of plants.
 
     Returns
     -------
     function
-        It takes observations in NumPy arrays, one row for each plant, and returns what the
-        policy returns as actions.
+        Function of observations in NumPy arrays, one row for each plant. The function returns
+        the actions of the policy, one row for each plant.
 
     Raises
     ------
@@ -97,9 +104,10 @@ def start(policy: Any, n: int) -> Act:
 def _predicting(predict: Callable[..., Any], n: int) -> Act:
     """Return a `predict` in the form of Stable-Baselines3 as a function of observations.
 
-    The function is for one round of n episodes. It passes the keywords `state`,
-    `episode_start` and `deterministic=True` to `predict`, except keywords that `predict` does
-    not take, and keywords that a `functools.partial` has set.
+    The function is for one round of n episodes, and keeps the state of a recurrent policy from
+    call to call. The function passes the keywords `state`, `episode_start` and
+    `deterministic=True` to `predict`, except keywords that `predict` does not take, and
+    keywords that a `functools.partial` has set.
     """
     parameters = inspect.signature(predict).parameters
     kinds = {parameter.kind for parameter in parameters.values()}
@@ -111,6 +119,7 @@ def _predicting(predict: Callable[..., Any], n: int) -> Act:
             del keywords[name]
 
     def act(observations: Any) -> Any:
+        """Return the actions that `predict` returns, and keep the state that follows."""
         returned = predict(observations, **keywords)
         if "episode_start" in keywords:
             keywords["episode_start"] = np.zeros(n, np.bool_)
@@ -125,15 +134,16 @@ def _predicting(predict: Callable[..., Any], n: int) -> Act:
 
 
 def _taking_tensors(act: Act, module: Any) -> Act:
-    """Return the function of NumPy arrays that calls a module, or its method, with tensors.
+    """Return a function of NumPy arrays that calls a PyTorch module with tensors.
 
-    Tensors have the type and the device of the module's weights. If the module has no weights,
-    tensors are of float32 on the CPU.
+    `act` is the module or a method of the module. The tensors have the type and the device of
+    the module's weights. If the module has no weights, the tensors are of float32 on the CPU.
     """
     torch: Any = sys.modules["torch"]  # as this package does not depend on PyTorch
     weights = next(module.parameters(), torch.empty(0))
 
     def in_tensors(observations: Any) -> Any:
+        """Return observations as tensors: an array, or arrays in a dict or a tuple."""
         if isinstance(observations, Mapping):
             return {name: in_tensors(part) for name, part in observations.items()}
         if isinstance(observations, tuple):
@@ -144,10 +154,11 @@ def _taking_tensors(act: Act, module: Any) -> Act:
 
 
 def _in_evaluation_mode(act: Act, module: Any) -> Act:
-    """Return a function that calls a module, or its method, as a policy is called.
+    """Return a function that calls a PyTorch module in evaluation mode, without gradients.
 
-    During a call, the module is in evaluation mode, and computes no gradients. The flags of all
-    its parts are put back after each call. Actions in a tensor are returned as an array.
+    `act` is what is called: the module or a function that calls the module. The training flags
+    of the module's parts are put back after each call. Actions in a tensor are returned as a
+    NumPy array.
     """
     torch: Any = sys.modules["torch"]
     parts = [part for part in module.modules() if hasattr(part, "training")]
@@ -158,6 +169,7 @@ def _in_evaluation_mode(act: Act, module: Any) -> Act:
         set_mode = partial(torch.nn.Module.train, module)
 
     def evaluating(observations: Any) -> Any:
+        """Return the actions of the module, called in evaluation mode without gradients."""
         with _LOCK, torch.no_grad():
             is_training = getattr(module, "training", False)  # a frozen script has no flag
             flags = [part.training for part in parts]

@@ -1,4 +1,4 @@
-"""Step a policy through a vector environment, and check the episodes that it runs."""
+"""Step a policy through a vector environment, and check that the episodes are as expected."""
 
 from __future__ import annotations
 
@@ -15,28 +15,31 @@ from mptc_gym.plant import action_from_command
 from mptc_gym.scoring.policies import Act
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
-_TOLERANCE: Final = 1e-6  # of infos, in their units, and relative to their values
+# Allowed difference of infos from expected infos, absolute, in the unit of the info, plus
+# relative to the expected info: far above rounding errors, and far below any other change.
+_TOLERANCE: Final = 1e-6
 
-Infos = Mapping[str, Any]  # by name, arrays of shape (n,)
+Infos = Mapping[str, Any]  # infos of n plants by name, in arrays of shape (n,)
 
 
 class Sample(NamedTuple):
-    """What n plants return at one sample."""
+    """What n plants return at one sample k."""
 
     observations: Any  # one row for each plant, as the policy receives them
-    infos: Infos  # of this sample, also where the same step begins the next episode
+    infos: Infos  # infos of sample k; at the end of an episode, not those of the next episode
     ended: NDArray[np.bool_]  # whether this sample is the last of an episode, shape (n,)
 
 
 def rollout(env: Any, act: Act, samples: int, seeds: list[int]) -> Iterator[Sample]:
-    """Reset plants, step them with the actions of a policy, and yield the samples.
+    """Reset plants, step the plants with the actions of a policy, and yield the samples.
 
     Parameters
     ----------
     env
         A vector environment of Gymnasium with n plants.
     act
-        The policy: it takes observations, one row for each plant, and returns actions.
+        The policy, as a function of observations, one row for each plant, that returns actions,
+        one row for each plant.
     samples
         Number N of steps: N + 1 samples are yielded, k = 0, 1, ..., N.
     seeds
@@ -62,9 +65,10 @@ def rollout(env: Any, act: Act, samples: int, seeds: list[int]) -> Iterator[Samp
 
 
 def in_columns(infos: Any) -> Infos:
-    """Return infos by name, as arrays of shape (n,).
+    """Return the infos of n plants by name, in arrays of shape (n,).
 
-    Infos that come as dicts, one for each plant, are reduced to their numbers.
+    Infos in a dict are returned as they are. Of a list with a dict for each plant, only entries
+    that are numbers are taken, with NaN for a plant that lacks an entry.
     """
     if isinstance(infos, Mapping):
         return infos
@@ -73,7 +77,10 @@ def in_columns(infos: Any) -> Infos:
 
 
 def _checked(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return the actions of a policy as an array; ValueError if the plants cannot take them."""
+    """Return the actions of a policy as an array, after checking that plants can take them.
+
+    A ValueError is raised if the actions are not finite numbers of the shape `shape`.
+    """
     if isinstance(actions, tuple):
         allowed = (
             "a function that returns actions alone, such as lambda o: agent.get_action(o)[0], "
@@ -85,7 +92,7 @@ def _checked(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         if checked.shape == shape and np.isfinite(checked).all():
             return checked
         received = f"{shorten(checked)}, shape {checked.shape}"
-    except (TypeError, ValueError, RuntimeError) as error:  # the last: from tensors
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: from tensors
         received = f"{shorten(actions)} ({error})"
     raise ValueError(f"policy must return finite actions, shape {shape}, got {received}")
 
@@ -93,11 +100,25 @@ def _checked(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 def replayed(
     samples: Iterator[Sample], parameters: Parameters, seeds: list[int]
 ) -> Iterator[Sample]:
-    """Yield the samples of a rollout, as long as they are those of the seeds' episodes.
+    """Yield the samples of a rollout, as long as the samples are those of the seeds' episodes.
 
-    Plain plants with these parameters and seeds receive the commands of the rollout. A
-    ValueError is raised at the first sample whose infos differ from those of the plain plants:
-    the environment has then reseeded, skipped samples, or changed the plant or the infos.
+    A `MiddlePointVectorEnv` with the same arguments and seeds receives the commands of the
+    rollout, and must return the same infos.
+
+    Parameters
+    ----------
+    samples
+        The samples of the rollout.
+    parameters
+        The arguments of the plants.
+    seeds
+        The seed of each plant's episode.
+
+    Raises
+    ------
+    ValueError
+        If the infos of a sample differ from those of the `MiddlePointVectorEnv`: the
+        environment has reseeded, skipped samples, or changed the plant or the infos.
     """
     plants = MiddlePointVectorEnv(len(seeds), **asdict(parameters))
     _, expected = plants.reset(seed=seeds)
@@ -114,8 +135,9 @@ def replayed(
 
 
 def _compare(infos: Infos, expected: Infos, k: int) -> None:
-    """Raise a ValueError if the infos of sample k differ from the expected ones."""
-    # The last names first: a number that was drawn says more than what follows from it.
+    """Raise a ValueError if the infos of sample k differ from the expected infos."""
+    # The last names first: a plant number that was drawn explains more than the infos that
+    # follow from the plant number.
     for name in reversed([name for name in expected if not name.startswith("_")]):
         differences = np.abs(infos.get(name, np.nan) - expected[name])
         if not (differences <= _TOLERANCE * (1.0 + np.abs(expected[name]))).all():

@@ -1,4 +1,4 @@
-"""Wrap an environment so that the action changes the flow instead of setting it.
+"""Wrap an environment so that the action changes the feedwater flow instead of setting it.
 
 `mptc_gym.wrappers.vector` has the same wrapper for vector environments.
 """
@@ -19,55 +19,61 @@ from mptc_gym.checks import is_number, one_action, reject
 from mptc_gym.parameters import Parameters
 from mptc_gym.plant import action_from_command, float32_action
 
-NUMBERS = "dead_zone", "u_min", "u_max"  # the arguments of the plant that an actuator has, t/h
+NUMBERS = "dead_zone", "u_min", "u_max"  # the arguments that describe the actuator, t/h
 
 
 class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructorArgs):
     """The action changes the flow instead of setting it: the velocity form of process control.
 
-    The wrapper keeps a wanted flow v, in t/h, which is 0 after `reset`. An action w moves it::
+    The wrapper keeps a wanted flow v, in t/h, which is 0 after `reset`. An action w, from -1 to
+    1, moves the wanted flow::
 
         v(k) = v(k-1) + w(k) max_move (u_max - u_min) / 2,   limited to [u_min, u_max]
 
-    and the command is u(k) = v(k). The velocity form spares the valve, and makes exploration
-    effective, as each change of the flow lasts.
+    where u_min and u_max are the limits of the actuator. The commanded flow is u(k) = v(k). The
+    velocity form spares the valve, and makes exploration effective, as each change of the flow
+    lasts.
 
-    With `compensate_dead_zone`, the command skips the dead zone, of half width z::
+    With `compensate_dead_zone`, the commanded flow u skips the dead zone, of half width z,
+    t/h::
 
         v > 0:   u =  z + (u_max - z) v / u_max
         v = 0:   u =  0
         v < 0:   u = -z + (u_min + z) v / u_min
 
-    With compensation, every change of v has an effect, and v reaches every flow that the
-    actuator can apply. The command stays 0 from `reset` until the first nonzero action.
+    With compensation, every change of the wanted flow v has an effect, and v reaches every flow
+    that the actuator can apply. The commanded flow stays 0 from `reset` until the first nonzero
+    action.
 
-    The action space is `Box(-1, 1, (1,), float32)`; actions beyond it are clipped. Observation,
-    reward (with `move_weight`) and info are those of the environment, which receives absolute
-    actions. A policy must know v, which follows from the newest action in `action_window`. With
-    the nominal delay, `action_window=20` makes the noise-free problem Markov while the set
-    point holds.
+    The action space is `Box(-1, 1, (1,), float32)`; actions beyond +-1 are clipped.
+    Observation, reward (with `move_weight`) and info are those of the wrapped environment,
+    which receives absolute actions: actions that set the flow. A policy must know the wanted
+    flow v, which follows from the newest past action in the observation, so `action_window`
+    must be at least 1. With the default delay of 18 samples, `action_window=20` makes the
+    problem without noise a Markov decision process as long as the set point stays constant.
 
     Parameters
     ----------
     env
         A `MiddlePointEnv`, wrapped or not.
     max_move
-        Change of the wanted flow by an action of 1, as a share of half the range, up to 2.
+        Change of the wanted flow by an action of 1, as a share of (u_max - u_min) / 2: a number
+        above 0, up to 2.
     compensate_dead_zone
-        False leaves the dead zone as it is. True compensates the dead zone of the plant, as
-        drawn for the episode if `dead_zone` is a range. A number compensates a dead zone with
-        this half width, t/h.
+        False leaves the dead zone as it is. True compensates the dead zone of the plant, or of
+        the present episode if `dead_zone` is a range. A number compensates a dead zone with
+        this number as half width, t/h.
 
     Attributes
     ----------
     increments : (float, bool or float)
-        `max_move` and `compensate_dead_zone`.
+        The arguments `max_move` and `compensate_dead_zone`.
 
     Raises
     ------
     ValueError
-        If an argument is out of range; from `step`, if the action is not one finite number. A
-        `step` that raises this error leaves the wrapper and the environment unchanged.
+        If an argument is out of range. Also raised by `step`, if the action is not one finite
+        number; this error leaves the wrapper and the environment unchanged.
 
     Examples
     --------
@@ -96,12 +102,16 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         self.increments = max_move, compensate_dead_zone
         self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}
         self._actuator = Actuator(self._numbers, *self.increments)
-        self._flow = 0.0  # v, t/h
+        self._flow = 0.0  # wanted flow v, t/h
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment, and set the wanted flow v to 0."""
+        """Reset the environment, and set the wanted flow to 0 t/h.
+
+        `seed` and `options`, and the observation and the info that are returned, are those of
+        the wrapped environment.
+        """
         observation, info = self.env.reset(seed=seed, options=options)
         drawn_numbers = {name: info[name] for name in NUMBERS if name in info}
         self._actuator = Actuator(self._numbers | drawn_numbers, *self.increments)
@@ -112,7 +122,12 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         return f"<{type(self).__name__}{self.increments}{self.env}>"
 
     def action(self, action: Any) -> NDArray[np.float32]:
-        """Move the wanted flow by an action, shape (1,), and return the absolute action."""
+        """Move the wanted flow by an action, and return the absolute action.
+
+        The argument and the result have the shape (1,). The absolute action is the action of
+        the wrapped environment that sets the flow. A ValueError is raised if the argument is
+        not one finite number.
+        """
         move = max(-1.0, min(1.0, one_action(action)))
         actuator = self._actuator
         flow = self._flow + actuator.move * move
@@ -121,16 +136,22 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 
 
 class Actuator:
-    """What the wrappers know of an actuator, to find the actions that make it apply a flow.
-
-    The numbers are floats for one plant, or arrays of shape (n,) for n plants.
+    """Dead zone and limits of an actuator, and the actions that make the actuator apply a flow.
 
     Parameters
     ----------
     numbers
-        `dead_zone`, `u_min` and `u_max`, t/h, by name.
+        `dead_zone`, `u_min` and `u_max`, t/h, by name: floats for one plant, or arrays of shape
+        (n,) for n plants.
     max_move, compensate_dead_zone
-        The arguments of the wrappers.
+        The arguments of `IncrementalAction`.
+
+    Attributes
+    ----------
+    u_min, u_max : float or array
+        The limits of the actuator, t/h.
+    move : float or array
+        Change of the wanted flow by an action of 1, t/h.
 
     Raises
     ------
@@ -148,23 +169,30 @@ class Actuator:
             reject("compensate_dead_zone", zone, "True, False or a number from 0 to 1e9")
         self.u_min = numbers["u_min"]
         self.u_max = numbers["u_max"]
-        self.move = max_move * ((self.u_max - self.u_min) / 2.0)  # by an action of 1, t/h
+        # Change of the wanted flow by an action of 1, t/h.
+        self.move = max_move * ((self.u_max - self.u_min) / 2.0)
         self._compensates = zone is not False
-        # The half width of the zone that is skipped, t/h.
+        # The half width of the dead zone that the commands skip, t/h; False, that is 0, without
+        # compensation.
         self._zone: Any = numbers["dead_zone"] if zone is True else zone
         self._slope_above = self._slope(self.u_max)
         self._slope_below = self._slope(-self.u_min)
 
     def _slope(self, limit: Any) -> Any:
-        """Return the change of the command for a change of the flow by 1, up to a limit, t/h.
+        """Return the change of the command per change of the wanted flow, as a ratio.
 
-        The slope is 0 for a limit inside the dead zone: (29) limits a command on the edge of
-        the zone to this limit.
+        `limit` is the magnitude of the limit towards which the flow moves, t/h. The slope is 0
+        for a limit inside the dead zone: equation (29) of the paper limits a command on the
+        edge of the dead zone to this limit.
         """
         return np.maximum(limit - self._zone, 0.0) / np.where(limit > 0.0, limit, 1.0)
 
     def action(self, flow: Any) -> Any:
-        """Return the environment's action for a wanted flow in t/h, a float or an array."""
+        """Return the absolute action for a wanted flow in t/h, which is a float or an array.
+
+        The absolute action is the action of the wrapped environment that sets the flow. With
+        compensation, the command of this action skips the dead zone.
+        """
         if not self._compensates:
             return action_from_command(flow, self.u_min, self.u_max)
         above = (flow > 0.0) * (self._zone + self._slope_above * flow)

@@ -1,4 +1,4 @@
-"""Wrap a vector environment so that actions change the flow instead of setting it."""
+"""Wrap a vector environment so that actions change the feedwater flow instead of setting it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mptc_gym.wrappers import NUMBERS, Actuator
 class IncrementalAction(VectorActionWrapper):
     """The action changes the flow: `mptc_gym.wrappers.IncrementalAction` for many plants.
 
-    The wrapper keeps a wanted flow for each plant. All that `reset` and `step` return equals
-    what the same number of single wrapped environments return. All three autoreset modes and
-    partial resets work.
+    The wrapper keeps a wanted flow, in t/h, for each plant. `reset` and `step` return what as
+    many single environments would return, each in `mptc_gym.wrappers.IncrementalAction`. All
+    three autoreset modes, and resets of some of the plants, work.
 
     Parameters
     ----------
@@ -34,8 +34,8 @@ class IncrementalAction(VectorActionWrapper):
     Raises
     ------
     ValueError
-        If `env` is of another kind or an argument is out of range; from `step`, if actions are
-        not finite numbers, shape (num_envs, 1).
+        If `env` is of another kind or an argument is out of range. Also raised by `step`, if
+        actions are not finite numbers of shape (num_envs, 1).
     """
 
     def __init__(
@@ -65,8 +65,13 @@ class IncrementalAction(VectorActionWrapper):
         self._ended = np.zeros(self.num_envs, np.bool_)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        """Reset all environments, or those of `reset_mask`, and their wanted flows to 0."""
-        # Read first, as Gymnasium's vector environments remove the mask from the options.
+        """Reset all environments, or those of `reset_mask`, and their wanted flows to 0 t/h.
+
+        `seed` and `options`, which may hold `reset_mask`, are those of the wrapped environment,
+        and so are the observations and infos that are returned.
+        """
+        # The mask is read before the reset, in which Gymnasium's vector environments remove the
+        # mask from the options.
         mask = options.get("reset_mask") if isinstance(options, Mapping) else None
         if mask is None:
             mask = np.ones(self.num_envs, np.bool_)
@@ -75,7 +80,10 @@ class IncrementalAction(VectorActionWrapper):
         return observations, infos
 
     def step(self, actions: Any) -> Any:
-        """Move the wanted flows by actions, shape (num_envs, 1), and step the environments."""
+        """Move the wanted flows by actions, shape (num_envs, 1), and step the environments.
+
+        The result is what `step` of the wrapped vector environment returns.
+        """
         moves = many_actions(actions, self.num_envs, self._ended)
         actuator = self._actuator
         flows = self._flows + actuator.move * moves.clip(-1.0, 1.0)
@@ -93,9 +101,10 @@ class IncrementalAction(VectorActionWrapper):
         return returned
 
     def _begin_episodes(self, begins: NDArray[np.bool_], infos: dict[str, Any]) -> None:
-        """Set wanted flows to 0, and take the numbers of the actuator from infos.
+        """Set wanted flows to 0, and take the drawn limits and dead zones from infos.
 
-        `begins` says of which plants an episode begins, shape (num_envs,).
+        `begins` says of which plants an episode begins, shape (num_envs,). `infos` are the
+        infos at k = 0 of these plants.
         """
         for name in {*NUMBERS} & {*infos}:
             self._numbers[name][begins] = infos[name][begins]
