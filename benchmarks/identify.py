@@ -65,7 +65,8 @@ class Options:
 
 def work(options: Options) -> str:
     """Identify the plant of a log, write the plant and a report, and return a closing line."""
-    # SciPy reads it when it is imported. Threads for small matrices only wait for each other.
+    # SciPy reads this variable when SciPy is imported. With small matrices, several threads are
+    # slower than one thread, as the threads wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
     from benchmarks.lib.report import Section, write_report  # here: slow to import, as below
@@ -108,8 +109,8 @@ def read_log(options: Options) -> Log:
     """Return the log in the file that the options name, with all gaps filled.
 
     A missing temperature is interpolated between its neighbours. A missing flow or disturbance
-    gets the value of the row before. If the log cannot be used, a `UsageError` names the
-    column, and the line if it is a single one.
+    gets the value of the row before. A `UsageError` is raised if the log cannot be used; the
+    message says why.
     """
     from benchmarks.loop.identification import Log
 
@@ -188,7 +189,7 @@ def read_numbers(column: pd.Series[str]) -> pd.Series[float]:
 
     `column` is a column of `read_table`. A `UsageError` names the line of the first text that
     is not a number. A `UsageError` is also raised if all texts with a decimal mark have three
-    digits behind it, because the mark may then separate thousands.
+    digits behind the mark, as in "1,480", because the mark may separate thousands.
     """
     import pandas as pd
 
@@ -369,8 +370,8 @@ def argument_ranges(
     limits = intervals[["low", "high"]].T
     largest_flow = max(-arguments["u_min"], arguments["u_max"])
     gain_factors = limits.gain / intervals.value["gain"]
-    # The factor multiplies the environment's time constant, which is 1 / rate samples for the
-    # rate of 1 - pole. The factor must be above this rate.
+    # `time_constant_factor` multiplies the environment's time constant, 1 / rate samples with
+    # the rate 1 - pole. The environment accepts factors above the rate.
     rates = 1.0 - np.exp(-arguments["sampling_interval"] / intervals.loc["time_constant"])
     slow_factors = np.clip(
         rates["value"] / rates[["low", "high"]], 1.000001 * rates["value"], 10.0
@@ -445,7 +446,8 @@ def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
 def draw(fit: Fit, title: str, path: Path) -> None:
     """Draw the temperature of a log, the simulated temperature, and the flow over time.
 
-    `title` is the title of the picture, and `path` is the PNG file.
+    The simulated temperature is that of the model in `fit`, without noise. `title` is the title
+    of the picture, and `path` is the PNG file.
     """
     from benchmarks.lib.pictures import COLOURS, DEAD_ZONE, open_picture
 

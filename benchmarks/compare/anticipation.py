@@ -3,7 +3,7 @@
 A controller anticipates if it acts before a change of the set point. The half period of the
 square wave is the longest time for which a random set point is constant. So a policy that was
 trained with random set points can learn to expect a change after this time. On the square wave,
-such a policy acts before the changes, and its error can be smaller than that of the best
+such a policy acts before the changes, and the mean error can be smaller than that of the best
 controller without foresight. Since foresight is no skill in control, a report marks controllers
 that anticipate, and scores them in surprising runs: runs with the same seeds, in which nobody
 can foresee when the set point changes.
@@ -79,9 +79,11 @@ def anticipation(
     runs: int,
     seed: int,
 ) -> Anticipation | None:
-    """Return how much a controller anticipates changes of a square wave; None if it does not.
+    """Return how much a controller anticipates the changes of a square wave, if it does.
 
-    If the controller anticipates, it runs again, with a set point that nobody can foresee.
+    The result is None if the controller does not act before the changes. If the controller acts
+    before the changes, it runs again, in surprising runs, in which nobody can foresee when the
+    set point changes.
 
     Parameters
     ----------
@@ -112,17 +114,18 @@ def movement_before_changes(
 ) -> Estimate | None:
     """Return how far the output moves to a new set point before it can respond to the change.
 
-    The result is a share of the set-point change, a mean over all changes. It is None if the
-    set point changes too often for the following comparison.
+    The result is a share of the set-point change, a mean over all changes. The result is None
+    if the set point changes too often for the following comparison.
 
     With the delay d of the plant, in samples, a flow changes the output d + 1 samples later. So
     the output in the first d + 1 samples after a set-point change does not depend on what the
     controller does at the change or later. The mean output in these d + 1 samples is compared
     with the mean output in a window of d + 1 samples before the change. The window lies between
     a quarter and three quarters of the time for which the old set point is constant. Of all
-    such windows, the one is taken in which the output, a mean over all runs, is nearest to the
-    new set point. Hence a controller whose output oscillates around the set point, or has not
-    reached the set point, does not count as a controller that anticipates.
+    windows in this time, the comparison takes the window in which the output, a mean over all
+    runs, is nearest to the new set point. Hence a controller whose output oscillates around the
+    set point, or has not reached the set point, does not count as a controller that
+    anticipates.
 
     Parameters
     ----------
@@ -158,7 +161,9 @@ def _run_surprised(
     seeds: NDArray[np.int64],
     are_equal: bool,
 ) -> Anticipation:
-    """Run a controller that anticipates in surprising runs, and return its errors there.
+    """Run a controller with set points that nobody can foresee, and return the errors.
+
+    This function is called for controllers that act before a square wave changes.
 
     Parameters
     ----------

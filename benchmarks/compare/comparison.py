@@ -27,7 +27,8 @@ from mptc_gym.evaluation import EPISODES
 
 BOOTSTRAP_SEED = 0  # of the resampling for confidence intervals, not of an episode
 
-# The anticipation of each controller that anticipates, by the names of scenario and controller.
+# By the names of scenario and controller: only controllers that act before a square wave
+# changes.
 Anticipations = Mapping[tuple[str, str], Anticipation]
 
 
@@ -70,7 +71,8 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     """Run all members of a controller in a scenario, and return the results.
 
     If neither the scenario nor the controller uses random numbers, all runs of a member are
-    equal. Then each member runs once, and the results have a copy of the run for each seed.
+    equal. In this case, each member runs once, and the results have a copy of the run for each
+    seed.
 
     Parameters
     ----------
@@ -193,7 +195,7 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
         **scenario.arguments,
     }
     least = least_possible(**arguments)
-    least.score(0.0)  # This raises the error.
+    least.score(0.0)  # This raises a ValueError if an idle valve is as good as any controller.
     preview = least_possible(kind="preview", **arguments)
     return Scale(scenario, least, preview.value)
 
@@ -291,8 +293,8 @@ def misfits_of(
 def ranked(estimates: pd.DataFrame, misfits: Collection[str] = ()) -> dict[str, Estimate]:
     """Return the overall score of each controller, by name, in the order of the ranking.
 
-    The overall score is the mean score over scenarios, members and runs. The bootstrap of its
-    95 % confidence interval resamples members and runs in each scenario.
+    The overall score is the mean score over scenarios, members (the trained networks of a
+    controller) and runs. Its 95 % confidence interval is that of `bootstrap`.
 
     Parameters
     ----------
@@ -324,7 +326,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
-    """Write a table of numbers, texts and objects of class `Estimate` as a CSV file.
+    """Write a table of numbers, texts and objects of class `Estimate` to the CSV file `path`.
 
     A column of estimates becomes three columns: NAME has the values, and NAME_low and NAME_high
     have the ends of the intervals, with empty cells for infinite ends. Infinity in any other

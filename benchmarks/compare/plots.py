@@ -98,7 +98,7 @@ def scores_finding(scores: Mapping[str, Estimate]) -> str:
 
 
 def marks_of(agents: Sequence[str]) -> dict[str, Any]:
-    """Return, by controller, the keyword arguments with which `Axes.plot` draws its marker.
+    """Return keyword arguments of `Axes.plot` that draw the marker of a controller, by name.
 
     `agents` are the names of the controllers in options.
     """
@@ -118,7 +118,7 @@ def distance(scores: ArrayLike) -> NDArray[np.float64]:
 
 
 def _scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
-    """Make the x axis of `distance(scores)` logarithmic, and label its ticks with scores.
+    """Make the x axis of `axes` logarithmic in 1 minus the score, and label ticks with scores.
 
     `scores` has all scores that are drawn. If a score lies beyond an end of the axis, the label
     at this end begins with "<" or ">".
@@ -236,7 +236,8 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
 def _legend_of_responses(responses: pd.DataFrame, plant: Parameters) -> dict[str, Any]:
     """Return the lines and patches that the legend shows, by their texts.
 
-    The arguments are those of `plot_responses` and `_draw_flow`.
+    `responses` is the argument of `plot_responses`, and `plant` has the arguments of the
+    environment.
     """
     runs_differ = bool((responses["output_p90"] > responses["output_p10"]).any())
     run = Line2D([], [], color="black", linewidth=1.2)

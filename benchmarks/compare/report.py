@@ -120,8 +120,8 @@ def write(
     results
         The results of each controller in each scenario.
     scales
-        The least possible errors of the scenarios. A scenario for which they are missing is in
-        the CSV files, but not in the report.
+        The least possible errors of the scenarios. A scenario whose least possible errors are
+        missing is in the CSV files, but not in the report.
     controllers
         The record of each controller by name.
     folder
@@ -171,7 +171,8 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
     """Draw the scores, and the temperature and flow over time in each scenario.
 
     Controllers that do not fit the plants have no scores in the picture. Temperature and flow
-    are drawn for controllers whose record has `pictured`, or for all if none of them has it.
+    are drawn for the controllers whose record has `pictured` true, or for all controllers if
+    there is no such record.
 
     Parameters
     ----------
@@ -411,7 +412,7 @@ def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
 def costs_table(
     results: Sequence[Result], controllers: Mapping[str, ControllerSpec], scenario: Scenario
 ) -> pd.DataFrame:
-    """Return a table of texts on what each controller knows, how robust it is, and its costs.
+    """Return a table of texts on knowledge, robustness and costs, a row for each controller.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from mptc_gym.signals import LOAD_INTERVAL, Levels
 Array = NDArray[np.float64]
 
 HORIZON = 5  # flows in a plan, one a sample; the first flow is applied, then all are replanned
-SWEEPS = 100  # the largest number of sweeps of coordinate descent
+SWEEPS = 100  # limit of the sweeps of coordinate descent, to bound the time of a sample
 TOLERANCE = 1e-4  # t/h; coordinate descent stops if a sweep changes no flow by this much
 TINY = 1e-9  # added to variances, degC^2, and to divisors, so that none of them is 0
 WARM_UP = 200  # samples until the covariance of the Kalman filter hardly changes
@@ -91,12 +91,13 @@ class PredictiveController:
     medians, and the load is expected to stay as it is. The planned flows minimise the sum of
     squared differences between the expected outputs and the target outputs, for flows within
     the limits of the actuator. The sum is over the first HORIZON outputs that the planned flows
-    can affect. If the first planned flow lies inside the dead zone, it is replaced by 0 or by
-    the flow at the edge of the dead zone, whichever gives the plan with the smaller sum.
+    can affect. A first planned flow inside the dead zone is replaced by 0 or by the flow at the
+    edge of the dead zone, whichever gives the plan with the smaller sum.
 
-    The target outputs are the present set point, as if it never changed. If the environment
-    draws set points at random, the time since the latest set-point change shows how likely the
-    set point is to change within the delay, and `agents.hedge` computes the target outputs.
+    The target outputs are equal to the present set point, as if the set point never changed. If
+    the environment draws set points at random, the time since the latest set-point change shows
+    how likely the set point is to change within the delay, and `agents.hedge` computes the
+    target outputs.
 
     Parameters
     ----------
@@ -152,7 +153,7 @@ class PredictiveController:
         longest_memory = int(self._delay.max()) + len(self._parameters.b)
         self._inputs = np.zeros((n, 1 + longest_memory))
         self._plan = np.zeros((HORIZON, n))
-        self._setpoint = np.full(n, np.nan)  # the latest one, degC
+        self._setpoint = np.full(n, np.nan)  # the latest set point, degC
         self._age = np.zeros(n, np.intp)  # samples since the set point changed
 
     def act(self, observation: Array) -> NDArray[np.float32]:
@@ -242,7 +243,7 @@ class PredictiveController:
         self._state = state + gain * (output - state[:, 0])[:, np.newaxis]
 
     def _update_covariance(self, F: Array, Q: Array) -> Array:
-        """Advance the covariance of the Kalman filter by a sample, and return its gain.
+        """Advance the Kalman filter's covariance by a sample, and return the filter's gain.
 
         F is the state transition matrix, and Q is the covariance of the process noise, both of
         shape (runs, size, size), where size is the length of the state. The gain is the factor
@@ -334,7 +335,7 @@ class PredictiveController:
             The planned flows with which the descent starts, t/h, shape (HORIZON, runs).
         first_flow
             A fixed value of the first planned flow, t/h, shape (runs,) or one number for all
-            runs. If it is None, the first flow is chosen like the others.
+            runs; None if the first flow is chosen like the other flows.
         """
         plan = start.copy()
         free = range(HORIZON)

@@ -109,9 +109,9 @@ def chosen(
 def _split(text: str) -> tuple[str, str]:
     """Return NAME and LOCATION of a word `text` of the form NAME=LOCATION.
 
-    The word is a value of the option `--agent`. A `UsageError` is raised if it has another
-    form, if the name is that of a controller in `ROSTER`, or if the location, a file or a
-    module, does not exist.
+    The word is a value of the option `--agent`. A `UsageError` is raised if the word has
+    another form, if the name is that of a controller in `ROSTER`, or if the location, a file or
+    a module, does not exist.
     """
     name, _, location = text.partition("=")
     if name.lower() in ROSTER:
@@ -223,10 +223,10 @@ class UserCode:
 
 
 def _load_all(locations: Sequence[str]) -> dict[str, UserCode]:
-    """Load a user's controllers, and return them by location.
+    """Load a user's controllers, and return the loaded controllers by location.
 
-    A location is MODULE:FACTORY or ALGORITHM:FILE.zip. A `UsageError` names a location whose
-    code raises an error.
+    `locations` are texts MODULE:FACTORY or ALGORITHM:FILE.zip. A `UsageError` names a location
+    whose code raises an error.
     """
     codes = {}
     for location in locations:
@@ -286,11 +286,12 @@ def _build(*, network: UserCode, **prior_knowledge: Any) -> Any:
     Parameters
     ----------
     network
-        The loaded code. Its name is that of the argument that every record with `networks`
-        passes.
+        The loaded code. It takes the place of the trained network of other controllers, hence
+        the name of the argument.
     prior_knowledge
-        Quantities by name. The factory gets those quantities that are among its parameters, or
-        all if the factory has `**kwargs`.
+        What the controller may know about the plant: quantities by name. The factory is called
+        with the quantities that are among the parameters of the factory, or with all quantities
+        if the factory has `**kwargs`.
     """
     accepted = inspect.signature(network.factory).parameters
     accepts_all = any(argument.kind is argument.VAR_KEYWORD for argument in accepted.values())
@@ -365,8 +366,8 @@ class Policy:
         """Return the first argument of `opened`, and the keyword arguments of the environment.
 
         The first argument is an environment, a function that makes one, an id or an `EnvSpec`.
-        `arguments` are the keyword arguments of `gymnasium.make` that define the case; they are
-        returned unless the environment already has its own.
+        `arguments` are the keyword arguments of `gymnasium.make` that define the case. The
+        returned arguments are `arguments`, or empty if the environment is already defined.
         """
         if self.env is not None:
             return self.env, {}

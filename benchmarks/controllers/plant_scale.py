@@ -60,9 +60,10 @@ def scales(plant: Parameters) -> dict[str, float]:
 def difference(plant: Parameters, made_for: Parameters) -> str:
     """Return a text on the magnitudes of two plants that differ by a factor above `MUCH`.
 
-    The text is "" if no magnitude differs so much. Otherwise, it gives both values of each such
-    magnitude. The magnitudes are those of `scales`. `plant` is the plant on which a controller
-    runs, and `made_for` is the plant for which the controller was made.
+    The text has both values of each magnitude that differs, and is "" if no magnitude differs
+    by more than `MUCH`. The magnitudes are the gain, the reach, the time constant and the delay
+    that `scales` returns. `plant` is the plant on which a controller runs, and `made_for` is
+    the plant for which the controller was made.
     """
     expected = scales(made_for)
     parts = []
@@ -78,8 +79,8 @@ def difference(plant: Parameters, made_for: Parameters) -> str:
 def _finite_scales(plant: Parameters) -> dict[str, float]:
     """Return the four magnitudes of `scales` for a plant on which gains are searched.
 
-    A ValueError is raised if one of the magnitudes is 0 or infinite, since no search interval
-    could be derived from it.
+    A ValueError is raised if one of the magnitudes is 0 or infinite, since the intervals of a
+    search are proportional to ratios of magnitudes.
     """
     numbers = scales(plant)
     for name, value in numbers.items():
@@ -94,10 +95,10 @@ def _finite_scales(plant: Parameters) -> dict[str, float]:
 def pi_spans(plant: Parameters) -> Spans:
     """Return the intervals in which a search looks for the gains `kp` and `ki` on a plant.
 
-    The gains are those of a PI controller: `kp` is in t/h per degC, and `ki` is in t/h per degC
-    and sample. The intervals for the paper's plant are multiplied by the ratio of the gains of
-    the paper's plant and of `plant`, with its sign; that of `ki` is also multiplied by the
-    ratio of the time constants.
+    A PI controller has a proportional gain `kp` in t/h per degC, and an integral gain `ki` in
+    t/h per degC and sample. The intervals for the paper's plant are multiplied by the gain of
+    the paper's plant divided by the gain of `plant`. The interval of `ki` is also multiplied by
+    the time constant of the paper's plant divided by the time constant of `plant`.
     """
     numbers = _finite_scales(plant)
     paper_numbers = scales(PAPER)
@@ -139,9 +140,10 @@ def dahlin_spans(plant: Parameters) -> Spans:
 
 
 def _scaled(spans: Spans, factors: Mapping[str, float]) -> Spans:
-    """Return the intervals with both ends multiplied by a factor, by the name of the gain.
+    """Return intervals of gains with both ends multiplied by a factor.
 
-    `factors` has the factor of each gain.
+    `spans` has the interval of each gain, and `factors` has the factor of each gain, both by
+    the name of the gain.
     """
     scaled = {}
     for name, (first, last) in spans.items():

@@ -65,7 +65,7 @@ def with_bank(
 
 
 def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
-    """Return the paper's network after it has learnt on a plant, with learning switched off.
+    """Return the paper's network, trained on a plant, with further learning switched off.
 
     `parameters` are the arguments of the environment, `num_envs` is the number of runs in a
     batch, and the initial weights of run i have the seed `seed + i`.
@@ -79,8 +79,8 @@ def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
     """Return Dahlin's controller for a plant.
 
     `time_constant` is the plant's time constant, s, and `arguments` are the other arguments of
-    `DahlinController`. If `closed_loop_time_constant` is missing in them, it is `LAMBDA` times
-    the plant's time constant.
+    `DahlinController`. The default of `closed_loop_time_constant` is `LAMBDA` times the plant's
+    time constant.
     """
     arguments.setdefault("closed_loop_time_constant", LAMBDA * time_constant)
     return DahlinController(time_constant=time_constant, **arguments)

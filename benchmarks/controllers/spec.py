@@ -69,8 +69,9 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
 def delay_range(plant: Parameters) -> tuple[float, float] | None:
     """Return the shortest and the longest delay of a plant, s; None if the delay is fixed.
 
-    Both delays are the time from a flow to the first output that the flow can affect. So they
-    are one sample longer than the argument `delay` of the environment.
+    A delay is here the time from a flow to the first output that the flow can affect, so it is
+    one sample longer than the argument `delay` of the environment. The range of `plant.delay`
+    gives the two delays.
     """
     if not isinstance(plant.delay, Sequence):
         return None
@@ -82,7 +83,8 @@ def delay_range(plant: Parameters) -> tuple[float, float] | None:
 def setpoint_holds(plant: Parameters) -> tuple[float, float] | None:
     """Return the shortest and the longest time for which a random set point is constant, s.
 
-    The result is None if the set point of the environment is not random.
+    The result is None if the set point is not random. `plant` has the arguments of the
+    environment.
     """
     levels = Levels(plant)
     if not levels.random:
@@ -212,7 +214,8 @@ class ControllerSpec:
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
         """Return a record whose `build` always gets the arguments `gains`.
 
-        If the argument `tuned_by` is among the gains, it is no longer chosen automatically.
+        `gains` are arguments by name. If the time constant `tuned_by` is among the gains, the
+        value in `gains` replaces the value that `robust_time_constant` would choose.
         """
         tuned_by = "" if self.tuned_by in gains else self.tuned_by
         return replace(self, build=partial(self.build, **gains), tuned_by=tuned_by)
@@ -238,9 +241,9 @@ class ControllerSpec:
     def robust_time_constant(self, plant: Mapping[str, Any]) -> float:
         """Return the time constant for the argument `tuned_by` of `build`, s.
 
-        It is the smallest time constant with which Ms, the maximum sensitivity of the loop with
-        the nominal plant, is at most `sensitivity`. `plant` has the environment's arguments.
-        The time constant is rounded to four digits, so that it is the same on all machines.
+        The result is the smallest time constant with which Ms, the maximum sensitivity of the
+        loop with the nominal plant, is at most `sensitivity`. `plant` has the environment's
+        arguments. The result is rounded to four digits, so that it is equal on all machines.
         """
         parameters = Parameters(**plant)
         arguments = knowledge(self.prior_knowledge, parameters, 1, 0)
@@ -266,8 +269,8 @@ class ControllerSpec:
         """Return a sentence that says why the controller does not fit a plant; "" if it fits.
 
         A controller fits if `plant` agrees with the plant `made_for` in all that the controller
-        `assumes`. The error of a controller on a plant that it does not fit does not show how
-        good the controller is.
+        `assumes`. If a controller does not fit the plant, the error does not show how good the
+        controller is.
         """
         made_for = Parameters(**self.made_for)
         direction = plant_scale.direction(plant)

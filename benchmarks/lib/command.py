@@ -49,9 +49,8 @@ def stop(error: BaseException, program: str = "python -m benchmarks") -> NoRetur
     Parameters
     ----------
     error
-        The error. If it is the `ImportError` of a missing package in `EXTRAS`, the message
-        names the extra that installs the package. Any other `ImportError` is a bug, and is
-        raised again.
+        The error. For an `ImportError` of a missing package in `EXTRAS`, the message names the
+        extra that installs the package. Any other `ImportError` is a bug, and is raised again.
     program
         The command, such as "python -m benchmarks.compare", which begins the message.
     """
@@ -170,7 +169,7 @@ def _default_as_typed(default: object) -> str | None:
 
 
 def read(declared: type[Group], program: str, words: Sequence[str]) -> Group | None:
-    """Convert the words of a command line to options, or print the help if they have `--help`.
+    """Convert the words of a command line to options, or print the help after `--help`.
 
     Parameters
     ----------
@@ -215,8 +214,8 @@ def command(
     """Return the function `main` of the command `python -m benchmarks.NAME`.
 
     `main(arguments)` takes the words of a command line after the command, by default the words
-    with which this process was started. It reads the options, calls `work`, and returns the
-    exit status, as `finish` does.
+    with which this process was started. The function `main` reads the options, calls `work`,
+    and returns the exit status of the command, as `finish` does.
 
     Parameters
     ----------
@@ -421,10 +420,10 @@ def _ctrl_c_ignored() -> Iterator[None]:
 
 
 def _attempt(name: str, task: Task) -> Answer:
-    """Run the task called `name`, and return its outcome; an error is returned, not raised.
+    """Run the task called `name` in a worker process, and return the outcome of the task.
 
-    This function runs in a worker process. The error is a text, since not every exception can
-    be pickled.
+    If the task raises an error, the outcome has the error as text, since not every exception
+    can be pickled.
     """
     try:
         return Answer(name, task(), "")

@@ -50,8 +50,8 @@ DEAD_ZONE: Any = {"color": "0.5", "alpha": 0.2, "linewidth": 0}
 LIMIT: Any = {"color": "0.4", "linestyle": ":", "linewidth": 1.0}
 
 RATIO_LABEL = "error / lowest achievable error\n(axis logarithmic in the ratio minus 1)"
-# An error ratio of 1 lies at minus infinity on an axis that is logarithmic in the ratio minus
-# 1. So ratios below this one are drawn at this one.
+# The smallest error ratio that is drawn; smaller ratios are drawn at this ratio. An error ratio
+# of 1 would lie at minus infinity on an axis that is logarithmic in the ratio minus 1.
 RATIO_FLOOR = 1.001
 # Error ratios with a label on the axis of error ratios, about equally far apart.
 RATIO_TICKS = 1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0, 4.0, 11.0, 31.0
@@ -122,7 +122,7 @@ class Panels:
             panel.set_xlabel(x)
 
     def add_legend(self, entries: Mapping[str, Artist], columns: int) -> None:
-        """Add a legend in the unused part of the last row, or below all panels if it is full.
+        """Add a legend in the unused part of the last row of panels, or below all panels.
 
         Parameters
         ----------

@@ -67,7 +67,7 @@ class DeadZone(NamedTuple):
     half_width: float = 0.0  # half of the interval's length, t/h; 0 for no dead zone
 
     def passed(self, flow: Array) -> Array:
-        """Return the flow that acts on the plant when the valve is given `flow`, t/h.
+        """Return the flow that acts on the plant when `flow` is commanded, both in t/h.
 
         A flow inside the dead zone becomes the centre, as in equation (29) of the paper. The
         result has the shape of `flow`.
@@ -79,8 +79,8 @@ class DeadZone(NamedTuple):
 def respond(flows: Array, delay: float, slow: float, fast: float = 0.0) -> Array:
     """Return the output of a delay and one or two lags in series, with gain 1, for some flows.
 
-    The result has the shape of `flows`. It is exact for a flow that is constant from one row to
-    the next and was 0 before the first row.
+    The result has the shape of `flows`. The result is exact for a flow that is constant from
+    one row to the next and was 0 before the first row.
 
     Parameters
     ----------
@@ -142,8 +142,8 @@ class Unknowns(NamedTuple):
     def respond(self, flows: Array) -> Array:
         """Return the output of the delay and the lags, with gain 1, for changes of some flows.
 
-        `flows` has the shape (rows, ...), as has the result. The changes are those from the
-        first row, since the plant is taken to have been at rest at the flow of the first row.
+        A change is the difference of a flow from the flow in the first row, with which the
+        plant is taken to have been at rest. `flows` and the result have the shape (rows, ...).
         """
         return respond(flows - flows[0], self.delay, self.slow, self.fast)
 
@@ -307,7 +307,7 @@ class Fit:
         unexplained = whitened - orthonormal @ (orthonormal.T @ whitened)
         errors, terms = unexplained[:, 0], unexplained[:, 1:]
         powers = np.sum(terms**2, axis=0)
-        # A candidate that is a sum of terms of the background explains nothing more.
+        # A candidate that is a weighted sum of terms of the background cannot improve the fit.
         powers[powers <= 1e-10 * np.sum(whitened[:, 1:] ** 2, axis=0)] = np.inf
         products = terms.T @ errors
         return errors @ errors - products**2 / powers, products / powers
@@ -354,10 +354,10 @@ def possible_zones(
     flow
         The flow of the log, t/h, shape (rows,).
     operating_flow
-        The centre of the dead zone, t/h; None if it is unknown. Then centres in the whole range
-        of the flow are tried.
+        The centre of the dead zone, t/h; None if the centre is unknown. For an unknown centre,
+        the result has centres in the whole range of the flow.
     applied
-        Whether the flow was measured behind the valve. Then all half widths are 0.
+        Whether the flow was measured behind the valve. If it was, all half widths are 0.
     """
     centres = np.linspace(flow.min(), flow.max(), GRID)
     if operating_flow is not None:
@@ -376,10 +376,10 @@ def possible_zones(
 
 
 def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
-    """Return a first fit, without a dead zone and with one lag.
+    """Return a first fit of the model to a log, without a dead zone and with one lag.
 
-    The best of a grid of delays and time constants is chosen. The arguments are those of
-    `identify`.
+    The fit is the best of a grid of delays and time constants. `log`, `zones` and `end_row` are
+    the arguments of `identify`.
     """
     rows = len(log.flow)
     changes = log.flow - log.flow[0]
@@ -434,7 +434,7 @@ def with_lags(fit: Fit) -> Fit:
     Two lags are hardly better if they improve the fit by at most the constant `SECOND_LAG`.
     """
     single = replace(fit, unknowns=fit.unknowns._replace(ratio=0.0)).refined()
-    # A second lag takes the place of a part of the delay.
+    # In a model with two lags, the second lag replaces a part of the delay of one lag.
     start = single.unknowns._replace(delay=0.7 * single.unknowns.delay, ratio=0.4)
     double = replace(single, unknowns=start).refined()
     return double if single.improvement(double.squares) > SECOND_LAG else single
@@ -528,10 +528,10 @@ def estimates(fit: Fit) -> pd.DataFrame:
 def explained_share(fit: Fit) -> float:
     """Return how well a model of the first two thirds of a log predicts the last third.
 
-    A new model is fitted to the first two thirds of the log of `fit`. It simulates the
-    temperature in the last third from the flow and the measured disturbances. The result is the
-    share of the variance of the temperature in the last third that the simulation explains: 1
-    for a perfect simulation, and below 0 for a simulation that is worse than a constant.
+    A new model is fitted to the first two thirds of the log of `fit`. The new model simulates
+    the temperature in the last third from the flow and the measured disturbances. The result is
+    the share of the variance of the temperature in the last third that the simulation explains:
+    1 for a perfect simulation, and below 0 for a simulation that is worse than a constant.
     """
     end_row = 2 * len(fit.log.flow) // 3
     earlier = identify(fit.log, fit.zones, end_row)

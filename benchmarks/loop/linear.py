@@ -47,8 +47,8 @@ class LinearModel:
     """One plant or several plants, equation (28) of the paper, as linear systems at one sample.
 
     The coefficients of a plant that drifts hold for the step from sample k - 1 to sample k.
-    Other models have one plant at several samples k. In the shapes below, the dots stand for
-    the axis of the plants or of the samples; one plant at one sample has no such axis.
+    A model can also have one plant at several samples k. In the shapes below, the dots stand
+    for the axis of the plants or of the samples, which is missing for one plant at one sample.
 
     Parameters
     ----------
@@ -169,8 +169,8 @@ def nominal(parameters: Parameters) -> LinearModel:
 def step_test(parameters: Parameters) -> dict[str, float]:
     """Return the gain, time constant and delay that an engineer reads off a step response.
 
-    The step is one of the flow, on the nominal plant without noise. With the times t_28 and
-    t_63 at which the temperature has made 28.3 % and 63.2 % of its change, the time constant is
+    The flow steps on the nominal plant, without noise. With the times t_28 and t_63 at which
+    the temperature has made 28.3 % and 63.2 % of its change, the time constant is
     T = 1.5 (t_63 - t_28), and the delay is t_63 - T (C. L. Smith, "Digital Computer Process
     Control", 1972). As if read off a chart, the gain is rounded to four digits, the time
     constant to three digits, and the delay to a whole number of samples. The delay is the time

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 # Largest error of a settled output, divided by the set-point change (in `measure`) or by the
 # set point (in `settled`).
 SETTLING_BAND = 0.05
-START = 300  # samples that count as the start of a run: as long as a level of the square wave
+START = 300  # samples that count as the start of a run: half a period of the square wave
 CHANGE = 60  # samples after a set-point change that count as the response to the change
 LAST = 50  # samples at the end of a run whose errors decide whether the output has settled
 
@@ -249,7 +249,7 @@ def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]
         unknown = np.full(command.shape[1], np.nan)
         return {"dead_zone_share": unknown, "saturation_share": unknown}
     u_min, u_max = parameters.u_min, parameters.u_max
-    # The smallest command, t/h, that the plant does not take to be inside the dead zone.
+    # The smallest magnitude of a command, t/h, that the plant treats as outside the dead zone.
     edge = least_effective(parameters.dead_zone, u_min, u_max)
     is_inside = np.abs(command) < edge
     is_at_limit = (command <= u_min) | (command >= u_max)
@@ -304,7 +304,7 @@ def held(setpoint: Array) -> list[tuple[int, int]]:
 
 
 def mean_error(trajectory: Trajectory) -> Array:
-    """Return the mean absolute error of each run, degC, shape (runs,).
+    """Return the mean absolute error of each run in `trajectory`, degC, shape (runs,).
 
     The mean is over the samples k = 1 to N: the error at k = 0 does not depend on the
     controller.

@@ -34,8 +34,8 @@ class Scenario:
     samples : int
         Length of a run, in samples.
     arguments : dict
-        The arguments of the environment that differ from their defaults. They define the plant
-        and the set point.
+        The arguments of the environment that define the plant and the set point. All other
+        arguments have their defaults.
     """
 
     name: str
@@ -254,8 +254,8 @@ def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
 def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
     """Convert random plants that vary the paper's plant to variations of another plant.
 
-    The delay, the dead zone and the factors of gain and time constant of each returned plant
-    have the ratios to those of `plant` that the plant in `design` has to the paper's plant. The
+    In delay, dead zone, gain factor and time constant factor, each returned plant differs from
+    `plant` by the ratios by which the plant in `design` differs from the paper's plant. The
     noise variance keeps its ratio to the square of the temperature change that the flow can
     cause.
 
