@@ -1,7 +1,8 @@
 """Implement model predictive control (MPC) with an exact model of the plant and the actuator.
 
-The controller knows everything but future noise, loads and set points. The errors of the
-controller show how close a controller can come to the error bounds of `benchmarks.bounds`.
+The controller knows all parameters of the plant, the noise and the load, but no future noise,
+loads and set points. The errors of the controller show how close a controller can come to the
+error bounds of `benchmarks.bounds`.
 """
 
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ WARM_UP = 200  # samples until the covariance of the Kalman filter hardly change
 
 @dataclass(frozen=True)
 class _Model:
-    """The plants of n runs at one sample, and the effect of planned flows on their outputs.
+    """The plants of n runs at one sample, and the effect of planned flows on the outputs.
 
     Attributes
     ----------
@@ -82,10 +83,10 @@ class PredictiveController:
     """Plan, at each sample, the flows that bring the expected output to the set point.
 
     The controller knows the polynomials A, B and C and the delay d of the plant, equation (28)
-    of the paper, and how A and B drift, even if these are random numbers of a run. A Kalman
-    filter estimates the output, the white noise xi and the load from the transmitter's
-    readings. The load jumps, so the load is not normally distributed; the Kalman filter is then
-    still the best linear filter.
+    of the paper, and how A and B drift, even if the plant is random and differs from run to
+    run. A Kalman filter estimates the output, the white noise xi and the load from the
+    transmitter's readings. The load jumps, so the load is not normally distributed; the Kalman
+    filter is then still the best linear filter.
 
     The score depends on the mean of |e|, the absolute error. So the expected outputs are
     medians, and the load is expected to stay as it is. The planned flows minimise the sum of

@@ -61,7 +61,7 @@ class Log:
 
 
 class DeadZone(NamedTuple):
-    """A dead zone of a valve: an interval of flows that all have the effect of its centre."""
+    """A dead zone of a valve: an interval of flows that all act like the flow in its middle."""
 
     centre: float  # the middle of the interval, t/h
     half_width: float = 0.0  # half of the interval's length, t/h; 0 for no dead zone
@@ -159,8 +159,8 @@ class Fit:
     """A model that is fitted to a log.
 
     The rows from `first_row` to `end_row` are divided into blocks of successive rows, and the
-    model is fitted to the mean of each block. In a log of at most `MOST_BLOCKS` rows, each row
-    is a block.
+    model is fitted to the mean of each block. In a log of fewer than `MOST_BLOCKS` rows, each
+    row is a block.
 
     Attributes
     ----------
@@ -214,15 +214,15 @@ class Fit:
 
     @cached_property
     def flow_response(self) -> Array:
-        """The part of the temperature that the flow causes, degC, shape (rows,)."""
+        """The effect of the flow's changes on the temperature, degC, shape (rows,)."""
         return self.unknowns.gain * self.unknowns.respond(self.zone.passed(self.log.flow))
 
     @cached_property
     def background(self) -> Array:
         """The terms of the background before they are multiplied by `coefficients`.
 
-        The shape is (rows, terms). The background is the part of the temperature that the flow
-        does not cause, apart from noise. The first term is the constant 1.
+        The shape is (rows, terms). The background is the part of the temperature that is
+        neither noise nor an effect of the flow's changes. The first term is the constant 1.
         """
         slow, fast = self.unknowns.slow, self.unknowns.fast
         rows = np.arange(len(self.log.flow), dtype=np.float64)

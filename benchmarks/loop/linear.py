@@ -271,7 +271,7 @@ class LinearLoop:
         return cls(controller.transfer(), (numerator, denominator), delay)
 
     def characteristic(self, delay: int) -> Array:
-        """Return the characteristic polynomial of the loop for another delay of the plant.
+        """Return the characteristic polynomial of the loop for any delay of the plant.
 
         The result has the coefficients of z^0, z^-1, z^-2 and so on. The poles of the loop are
         the values of z at which the polynomial is 0. `delay` is the delay d of the plant,
