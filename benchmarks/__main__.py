@@ -1,4 +1,4 @@
-"""List the questions and the command that answers each of them: `python -m benchmarks`."""
+"""Print a list of questions, each with the command that answers it: `python -m benchmarks`."""
 
 import re
 import sys
@@ -10,9 +10,10 @@ FOLDER = Path(__file__).parent
 
 
 def commands() -> dict[str, str]:
-    """Return the module of each command by the command's name.
+    """Return the module of each command `python -m benchmarks.NAME` by the command's name.
 
-    A command is a file in this folder, or a folder with a `__main__.py`.
+    The module of a command is a file in the folder `benchmarks`, or the `__main__.py` of a
+    folder in `benchmarks`.
     """
     modules = {path.stem: f"benchmarks.{path.stem}" for path in FOLDER.glob("[a-z]*.py")}
     for path in FOLDER.glob("*/__main__.py"):
@@ -22,7 +23,10 @@ def commands() -> dict[str, str]:
 
 
 def questions() -> str:
-    """Return the questions and their commands, from the table in README.md of this folder."""
+    """Return the text that `python -m benchmarks` prints: questions, each above its command.
+
+    The questions and commands come from the table in `benchmarks/README.md`.
+    """
     page = FOLDER.joinpath("README.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| \[?(.+?)(?:\]\(\S+\))? \| `(python .+?)`", page, re.MULTILINE)
     lines = [f"{question}\n    {command}" for question, command in rows]

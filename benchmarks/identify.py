@@ -23,11 +23,12 @@ if TYPE_CHECKING:
 
     from benchmarks.loop.identification import Fit, Log
 
-FEWEST_ROWS = 100
-MOST_ROWS = 10_000  # of a longer log, the last rows are used, to limit time and memory
-LONGEST_GAP = 20  # sampling intervals between two rows
-MOST_MISSING = 0.2  # share of the values of a column that may be missing
-# One to three digits, and then groups of three digits: 1,480 may be 1.48 or 1480.
+FEWEST_ROWS = 100  # of a log; a shorter log hardly shows a delay and a lag
+MOST_ROWS = 10_000  # that are used: the last rows of a longer log, to limit time and memory
+LONGEST_GAP = 20  # sampling intervals between two rows; longer gaps are not interpolated
+MOST_MISSING = 0.2  # largest share of the values of a column that may be missing
+# Matches texts of one to three digits and then groups of three digits: in the text 1,480, the
+# comma may be a decimal mark or may separate thousands.
 THOUSANDS = r"[+-]?[1-9]\d{0,2}([.,]\d{3})+"
 CAPTION = "The log as it was recorded, and as the model simulates it from the flow"
 
@@ -63,8 +64,9 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Identify the plant of a log, and write the plant and a report."""
-    # SciPy reads it when it is imported. Threads for small matrices only wait for each other.
+    """Identify the plant of a log, write the plant and a report, and return a closing line."""
+    # SciPy reads this variable when SciPy is imported. With small matrices, several threads are
+    # slower than one thread, as the threads wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
     from benchmarks.lib.report import Section, write_report  # here: slow to import, as below
@@ -104,10 +106,11 @@ def work(options: Options) -> str:
 
 
 def read_log(options: Options) -> Log:
-    """Read the log of the options.
+    """Return the log in the file that the options name, with all gaps filled.
 
-    Missing temperatures are interpolated; missing flows and disturbances are those of the row
-    before. A `UsageError` names the column and the line that cannot be used.
+    A missing temperature is interpolated between its neighbours. A missing flow or disturbance
+    gets the value of the row before. A `UsageError` is raised if the log cannot be used; the
+    message says why.
     """
     from benchmarks.loop.identification import Log
 
@@ -146,9 +149,12 @@ def read_log(options: Options) -> Log:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Return the table of a file as texts, with NaN in empty cells.
+    """Return the table in a CSV file as texts, with NaN in empty cells.
 
-    The separator is a semicolon or a tab if the heading has one, and else a comma.
+    Columns are separated by semicolons or tabs if the first line of the file has one, and
+    otherwise by commas. A `UsageError` is raised if the file is not such a table or has fewer
+    than `FEWEST_ROWS` rows. The entry "marks" of the table's `attrs` has the possible decimal
+    marks.
     """
     import pandas as pd  # here: slow to import
 
@@ -179,10 +185,11 @@ def read_table(path: Path) -> pd.DataFrame:
 
 
 def read_numbers(column: pd.Series[str]) -> pd.Series[float]:
-    """Return a column of texts as numbers, with NaN for empty cells.
+    """Return the numbers of a column of texts, with NaN for empty cells.
 
-    A `UsageError` names the line of a text that is not a number. If all texts with a decimal
-    mark look like thousands, a `UsageError` names the first of these texts.
+    `column` is a column of `read_table`. A `UsageError` names the line of the first text that
+    is not a number. A `UsageError` is also raised if all texts with a decimal mark have three
+    digits behind the mark, as in "1,480", because the mark may separate thousands.
     """
     import pandas as pd
 
@@ -200,7 +207,11 @@ def read_numbers(column: pd.Series[str]) -> pd.Series[float]:
 
 
 def read_times(column: pd.Series[str]) -> NDArray[np.float64]:
-    """Return the times of a column of numbers (s) or dates, in seconds."""
+    """Return the times of a column of numbers (s) or dates, in seconds, shape (rows,).
+
+    `column` is a column of `read_table`. Dates become seconds since the first row. A
+    `UsageError` names the line of the first text that is neither a number nor a date.
+    """
     import pandas as pd
 
     numbers = pd.to_numeric(column.str.replace(",", "."), errors="coerce")
@@ -216,7 +227,17 @@ def read_times(column: pd.Series[str]) -> NDArray[np.float64]:
 
 
 def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> None:
-    """Raise a `UsageError` that names the first line of the file whose text is bad, if any."""
+    """Raise a `UsageError` if a column of the log has texts that cannot be read.
+
+    Parameters
+    ----------
+    column
+        The column of texts.
+    is_bad
+        Whether each text cannot be read. The message names the first line where this is true.
+    allowed
+        What a text must be, such as "a number", for the message.
+    """
     if is_bad.any():
         line = int(np.argmax(is_bad)) + 2
         raise UsageError(
@@ -226,10 +247,12 @@ def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> Non
 
 
 def row_numbers(seconds: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
-    """Return the number of samples since the first row, and the sampling interval (s).
+    """Return the sample of each row, counted from the first row, and the sampling interval.
 
-    The times are in seconds, (rows,). A row may come 0.4 sampling intervals early or late, and
-    up to 19 rows in succession may be missing. Other times are a `UsageError`.
+    The samples are integers, shape (rows,), and the sampling interval is in s. `seconds` has
+    the times of the rows, s, shape (rows,). A `UsageError` is raised if times do not increase,
+    if a row comes more than 0.4 sampling intervals early or late, or if 20 or more rows in
+    succession are missing.
     """
     steps = np.diff(seconds)
     is_usual = np.abs(steps / np.median(steps) - 1.0) < 0.5
@@ -250,9 +273,16 @@ def row_numbers(seconds: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]
 
 
 def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
-    """Return why a fit may be wrong, in a sentence for each reason.
+    """Return the warnings of the report: a sentence for each reason why a fit may be wrong.
 
-    `explained` is the share of the variance in the last third of the log that the fit explains.
+    Parameters
+    ----------
+    fit
+        The fit of the log.
+    intervals
+        The table of `benchmarks.loop.identification.estimates`.
+    explained
+        The result of `benchmarks.loop.identification.explained_share`.
     """
     log, errors = fit.log, fit.errors
     sentences = []
@@ -297,10 +327,11 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
 
 
 def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
-    """Return the arguments of `MiddlePoint-v0` for the plant of a fit.
+    """Return the arguments of the environment `MiddlePoint-v0` for the plant of a fit.
 
-    The set point is smaller and slower than the environment's default if the plant cannot
-    follow the default set point.
+    Flows are deviations from the centre of the dead zone. The options can set the limits of the
+    flow. If the plant cannot follow the environment's default set point, the set point has a
+    smaller amplitude or a longer period.
     """
     from benchmarks.loop.identification import polynomials
 
@@ -340,16 +371,22 @@ def is_one_sided(u_min: float, u_max: float) -> bool:
 def argument_ranges(
     intervals: pd.DataFrame, arguments: dict[str, Any]
 ) -> dict[str, list[float]]:
-    """Return the 95 % intervals as ranges [low, high] of the environment's arguments.
+    """Return the 95 % intervals of a plant as ranges of the environment's arguments.
 
-    `intervals` is the table of `estimates`. An argument whose interval is a single number is
-    left out.
+    A range is a list [low, high]. An argument whose interval has a length of 0 is left out.
+
+    Parameters
+    ----------
+    intervals
+        The table of `benchmarks.loop.identification.estimates`.
+    arguments
+        The arguments of the environment for the plant, as `plant_arguments` returns them.
     """
     limits = intervals[["low", "high"]].T
     largest_flow = max(-arguments["u_min"], arguments["u_max"])
     gain_factors = limits.gain / intervals.value["gain"]
-    # The factor multiplies the environment's time constant, which is 1 / rate samples for the
-    # rate of 1 - pole. The factor must be above this rate.
+    # `time_constant_factor` multiplies the environment's time constant, 1 / rate samples with
+    # the rate 1 - pole. The environment accepts factors above the rate.
     rates = 1.0 - np.exp(-arguments["sampling_interval"] / intervals.loc["time_constant"])
     slow_factors = np.clip(
         rates["value"] / rates[["low", "high"]], 1.000001 * rates["value"], 10.0
@@ -366,7 +403,19 @@ def argument_ranges(
 def findings(
     fit: Fit, explained: float, arguments: dict[str, Any], options: Options
 ) -> list[str]:
-    """Return the paragraphs of the report about a fit and the arguments of its plant."""
+    """Return the paragraphs of the report that follow the warnings.
+
+    Parameters
+    ----------
+    fit
+        The fit of the log.
+    explained
+        The result of `benchmarks.loop.identification.explained_share`.
+    arguments
+        The arguments of the environment for the plant, as `plant_arguments` returns them.
+    options
+        The options of the command.
+    """
     log, centre = fit.log, fit.zone.centre
     text = [
         f"The model explains {100 * max(explained, 0.0):.1f} % of the variance of the "
@@ -402,7 +451,10 @@ def findings(
 
 
 def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
-    """Return the table of `estimates` as a table of text, for the report."""
+    """Return the identified parameters of the plant as a table of texts, for the report.
+
+    `intervals` is the table of `benchmarks.loop.identification.estimates`.
+    """
     import pandas as pd
 
     rows = []
@@ -413,7 +465,11 @@ def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw(fit: Fit, title: str, path: Path) -> None:
-    """Draw the log, and the temperature that the model simulates from its flow."""
+    """Draw the temperature of a log, the simulated temperature, and the flow over time.
+
+    The simulated temperature is that of the model in `fit`, without noise. `title` is the title
+    of the picture, and `path` is the PNG file.
+    """
     from benchmarks.lib.pictures import COLOURS, DEAD_ZONE, open_picture
 
     log = fit.log

@@ -17,10 +17,10 @@ from mptc_gym.parameters import PlantNumbers
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-SAMPLES_PER_FRAME = 20
+SAMPLES_PER_FRAME = 20  # samples of the run between two frames of the film
 DURATION = 100  # ms for which a frame is shown
-LAST_DURATION = 2000  # ms for which the last frame is shown
-COLOURS = 24  # in the file; few colours make the file small
+LAST_DURATION = 2000  # ms for which the last frame is shown, before the film repeats
+COLOURS = 24  # number of colours in the film; few colours make the file small
 
 
 @options
@@ -41,7 +41,10 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run a controller on a case and write a film of the run."""
+    """Run a controller on a case, write a film of the run, and return the closing lines.
+
+    A `UsageError` is raised if an option is invalid.
+    """
     cases = options.plant.cases(SCENARIOS)
     wanted = options.scenario or next(iter(cases))
     known("--scenario", [wanted], cases)
@@ -68,7 +71,16 @@ def work(options: Options) -> str:
 def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed: int) -> None:
     """Write a film of a run as a GIF file.
 
-    `parameters` are the arguments of the environment, and `seed` is the seed of the run.
+    Parameters
+    ----------
+    path
+        The GIF file.
+    trajectory
+        The signals of the run.
+    parameters
+        The arguments of the environment.
+    seed
+        The seed of the run.
     """
     from PIL.Image import Dither, Quantize
 
@@ -84,10 +96,18 @@ def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed:
 
 
 def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterator[Image]":
-    """Yield the pictures that the environment draws in the first run of a trajectory.
+    """Yield the frames of a film: the pictures of a run as the environment renders them.
 
-    There is a picture after every `SAMPLES_PER_FRAME` samples. `parameters` are the arguments
-    of the environment, and `seed` is the seed of the run.
+    There is a picture after every `SAMPLES_PER_FRAME` samples.
+
+    Parameters
+    ----------
+    trajectory
+        The signals of a batch of runs; the film shows the first run.
+    parameters
+        The arguments of the environment.
+    seed
+        The seed of the first run, with which the environment drew the numbers of the plant.
     """
     from PIL import Image
 

@@ -51,7 +51,11 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run the comparison and write its results; write finished results after an error, too."""
+    """Run a comparison, write the results, and return a closing line.
+
+    If tasks fail or the user interrupts the comparison, the results of the tasks that have
+    finished are written before the exception is raised again.
+    """
     from benchmarks.compare.comparison import run_case, scale_of
     from benchmarks.compare.report import write
 
@@ -101,7 +105,10 @@ def work(options: Options) -> str:
 
 
 def cases(options: Options) -> tuple[str, list[Scenario]]:
-    """Return the name of the default folder, and the scenarios that the options ask for."""
+    """Return the name of the default folder in `results/`, and the scenarios to run.
+
+    A `UsageError` is raised if the options cannot be combined or name an unknown scenario.
+    """
     if options.presets and options.plant.name:
         raise UsageError("--presets cannot be combined with --plant, --preset and --set")
     if options.presets:

@@ -1,11 +1,12 @@
-"""Find controllers that move before a square wave changes, and score them by other runs.
+"""Find controllers that act before a square wave changes, and score them in other runs.
 
-A square wave changes at regular times, and its half period is the longest time for which a
-random set point holds. So a policy that was trained on random set points can learn from the age
-of a level that a change is near. On the square wave, such a policy moves before the change, and
-its error is smaller than that of the best controller without foresight. Foresight is no skill
-in control. So such a controller is marked, and is scored in other runs with the same seeds,
-whose levels hold for times that nobody can foresee.
+A controller anticipates if it acts before a change of the set point. The half period of the
+square wave is the longest time for which a random set point is constant. So a policy that was
+trained with random set points can learn to expect a change after this time. On the square wave,
+such a policy acts before the changes, and the mean error can be smaller than that of the best
+controller without foresight. Since foresight is no skill in control, a report marks controllers
+that anticipate, and scores them in surprising runs: runs with the same seeds, in which nobody
+can foresee when the set point changes.
 """
 
 import itertools
@@ -22,25 +23,33 @@ from benchmarks.loop.scenarios import Scenario
 
 Array = NDArray[np.float64]
 
-MARKED = 0.05  # A controller that makes this share of a change before the change is marked.
-TIMETABLES = 10  # of surprising runs; a tenth of the seeds has the same timetable
-TIMETABLE_SEED = 0  # of the changes in the first timetable; it seeds no episode
+# A controller counts as one that anticipates if the temperature makes at least this share of a
+# set-point change before it can respond to the change.
+MARKED = 0.05
+# Number of timetables, which say when the set point changes in surprising runs. A tenth of the
+# runs has the same timetable.
+TIMETABLES = 10
+TIMETABLE_SEED = 0  # of the random times in the first timetable, not of an episode
 
 
 @dataclass(frozen=True)
 class Anticipation:
-    """What a controller gains and loses by moving before a square wave changes.
+    """How much a controller anticipates on a square wave, and its errors in surprising runs.
+
+    In surprising runs, nobody can foresee when the set point changes. The error of a run is the
+    mean of |e|, the absolute error, over the samples.
 
     Attributes
     ----------
     movement : Estimate
-        Share of a change that the output has made before it can be a response to the change.
+        On the square wave: the share of a set-point change that the output has made before the
+        output can respond to the change.
     errors : Array
-        Mean |e| of the runs where changes surprise, degC, shape (members, runs).
+        Errors of the controller in surprising runs, degC, shape (members, runs).
     least : float
-        Least possible mean |e| without foresight where changes surprise, degC.
+        Least possible error in surprising runs without foresight, degC, a mean over the runs.
     idle : float
-        Mean |e| of an idle valve where changes surprise, degC.
+        Error of an idle valve in surprising runs, degC, a mean over the runs.
     """
 
     movement: Estimate
@@ -50,12 +59,16 @@ class Anticipation:
 
     @property
     def ratio(self) -> float:
-        """Mean error where changes surprise, divided by the least possible error there."""
+        """Mean error in surprising runs, divided by the least possible error in these runs."""
         return float(self.errors.mean() / self.least)
 
     @property
     def scores(self) -> Array:
-        """Scores of the runs where changes surprise, shape (members, runs)."""
+        """Score of each surprising run, shape (members, runs): 0 if idle, 1 if `least`.
+
+        A run with the error `idle` has the score 0, and a run with the error `least` has the
+        score 1. Members are the trained networks of a controller.
+        """
         return (self.idle - self.errors) / (self.idle - self.least)
 
 
@@ -66,16 +79,21 @@ def anticipation(
     runs: int,
     seed: int,
 ) -> Anticipation | None:
-    """Return the anticipation of a controller; None if it does not move before changes.
+    """Return how much a controller anticipates the changes of a square wave, if it does.
+
+    The result is None if the controller does not act before the changes. If the controller acts
+    before the changes, it runs again, in surprising runs, in which nobody can foresee when the
+    set point changes.
 
     Parameters
     ----------
     scenario
-        The scenario; without a square wave, the result is None.
+        The scenario. If the set point of the scenario is no square wave, the result is None.
     members
-        The members of the controller.
+        The records of the controller's members, one for each trained network.
     trajectories
-        The runs of each member in the scenario, or one run of each if all runs are equal.
+        The signals of each member's runs in the scenario. If all runs of a member are equal,
+        the signals are those of a single run.
     runs
         Number of runs of a member.
     seed
@@ -108,16 +126,25 @@ def movement_before_changes(
 ) -> Estimate | None:
     """Return how far the output moves to a new set point before it can respond to the change.
 
-    A flow shows d + 1 samples later. So until d samples after a change, the output is that of
-    the same seed with a set point that does not change, whatever the controller does at the
-    change. The mean output over these d + 1 samples is compared with the mean over d + 1
-    samples between a quarter and three quarters of the time for which the level before the
-    change holds. Of these, the samples are taken in which the mean of all runs is nearest to
-    the new set point. So a controller that swings around the set point, or has not reached it,
-    does not count as one that anticipates.
+    The result is a share of the set-point change, a mean over all changes. The result is None
+    if the set point changes too often for the following comparison.
 
-    The result is a share of the change, the mean over all changes. It is None if no level holds
-    long enough for the comparison. `trajectories` are the runs of each member.
+    With the delay d of the plant, in samples, a flow changes the output d + 1 samples later. So
+    the output in the first d + 1 samples after a set-point change does not depend on what the
+    controller does at the change or later. The mean output in these d + 1 samples is compared
+    with the mean output in a window of d + 1 samples before the change. The window lies between
+    a quarter and three quarters of the time for which the old set point is constant. Of all
+    windows in this time, the comparison takes the window in which the output, a mean over all
+    runs, is nearest to the new set point. Hence a controller whose output oscillates around the
+    set point, or has not reached the set point, does not count as a controller that
+    anticipates.
+
+    Parameters
+    ----------
+    scenario
+        The scenario, which has a square wave.
+    trajectories
+        The signals of the runs of each member of the controller.
     """
     window = int(scenario.parameters.range_of("delay")[0]) + 1
     setpoint = trajectories[0].setpoint[:, 0]
@@ -146,9 +173,23 @@ def _run_surprised(
     seeds: NDArray[np.int64],
     are_equal: bool,
 ) -> Anticipation:
-    """Run the members of a controller where changes surprise, and return its anticipation.
+    """Run a controller with set points that nobody can foresee, and return the errors.
 
-    If all runs of a member are equal (`are_equal`), it runs once with each timetable.
+    This function is called for controllers that act before a square wave changes.
+
+    Parameters
+    ----------
+    scenario
+        The scenario, which has a square wave. The surprising runs have the same plant.
+    members
+        The records of the controller's members, one for each trained network.
+    movement
+        The result of `movement_before_changes`, which becomes part of the returned object.
+    seeds
+        The seeds of the runs, shape (runs,).
+    are_equal
+        Whether nothing is random, so that all runs with one timetable are equal. Each member
+        then runs once with each timetable.
     """
     from benchmarks.bounds.least import (
         least_possible,
@@ -167,7 +208,8 @@ def _run_surprised(
         arguments = {**scenario.arguments, "setpoint": timetable}
         errors_of_members = []
         for member in members:
-            # It is made for the published scenario, so that it does not know the timetable.
+            # The controller is made for the scenario with the square wave, so that it cannot
+            # know the timetable.
             controller = member.make(scenario.arguments, count, first_seed)
             trajectory = member.run(arguments, scenario.samples, count, first_seed, controller)
             errors_of_members.append(np.broadcast_to(mean_error(trajectory), runs))
@@ -186,11 +228,13 @@ def _run_surprised(
 
 
 def surprising_setpoint(scenario: Scenario, seed: int) -> list[float]:
-    """Return a square wave whose changes nobody can foresee, degC, one number a sample.
+    """Return a set point whose changes nobody can foresee, degC, one number for each sample.
 
-    Its levels are those of the scenario's square wave, and hold as long on average. From half
-    of that time on, a level ends at each sample with the same probability. So the age of a
-    level does not tell when the level will end.
+    The set point has the two values of the scenario's square wave, in turn, and stays at each
+    value for half a period of the square wave on average. After a quarter of the period, the
+    set point changes at each sample with the same probability. So the time since the latest
+    change does not show when the next change comes. `seed` is the seed of the times of the
+    changes.
     """
     generator = np.random.default_rng(seed)
     parameters = scenario.parameters

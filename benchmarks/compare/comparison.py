@@ -1,4 +1,8 @@
-"""Run controllers in scenarios, and estimate how far they are from the least possible error."""
+"""Run controllers in scenarios, and compare their errors with the least possible errors.
+
+A scenario is a plant, a set point and a length of the runs. The error of a run is the mean of
+|e|, the absolute error, over the samples of the run.
+"""
 
 import math
 import time
@@ -21,33 +25,37 @@ from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES
 
-BOOTSTRAP_SEED = 0
+BOOTSTRAP_SEED = 0  # of the resampling for confidence intervals, not of an episode
 
-Anticipations = Mapping[
-    tuple[str, str], Anticipation
-]  # by the names of scenario and controller
+# By the names of scenario and controller: only controllers that act before a square wave
+# changes.
+Anticipations = Mapping[tuple[str, str], Anticipation]
 
 
 @dataclass(frozen=True)
 class Result:
-    """The results of a controller in a scenario.
+    """The results of one controller in one scenario.
+
+    A controller with several trained networks has one member for each network.
 
     Attributes
     ----------
     scenario : str
         Name of the scenario.
     agent : str
-        Name of the controller.
+        Name of the controller in options.
     runs : pandas.DataFrame
-        Measures, with a row for each run of each member of the controller.
+        A row for each run of each member. The columns are `scenario`, `agent`, `policy` (the
+        number of the member), `seed`, and the measures of `benchmarks.loop.rollout.measure`.
     responses : pandas.DataFrame
-        Percentiles over the runs, with a row for each sample.
+        A row for each sample, with the temperature and the flow of the first run and their
+        percentiles over the runs; see `_responses`.
     policies : sequence of mapping
-        Provenance of the members that were trained.
+        The origins of the trained networks, one for each member that was trained.
     seconds : float
         Processor time of the runs, s.
     anticipation : Anticipation, optional
-        What the controller gains and loses by moving before a square wave changes, if it does.
+        The errors in surprising runs, if the controller acts before a square wave changes.
     """
 
     scenario: str
@@ -60,10 +68,22 @@ class Result:
 
 
 def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: int) -> Result:
-    """Run all members of a controller in a scenario; run i has the seed `seed + i`.
+    """Run all members of a controller in a scenario, and return the results.
 
-    If nothing is drawn at random, all runs are equal. Then one run is made, and the results
-    have a copy of it for each seed.
+    If neither the scenario nor the controller uses random numbers, all runs of a member are
+    equal. In this case, each member runs once, and the results have a copy of the run for each
+    seed.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    controller
+        The record of the controller.
+    runs
+        Number of runs of each member.
+    seed
+        Seed of the first run; run i has the seed `seed + i`.
     """
     began = time.process_time()
     members = controller.members()
@@ -95,11 +115,21 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
 def _responses(
     trajectories: Sequence[Trajectory], scenario: Scenario, agent: str
 ) -> pd.DataFrame:
-    """Return the output and the applied flow over time, with a row for each sample.
+    """Return a table of a controller's temperature and flow over time, one row for each sample.
 
-    The table has the set point, the first run, and percentiles over all runs of all members.
-    `trajectories` has a batch of runs for each member. If the runs differ in their set points,
-    the percentiles are those of the first run alone.
+    The columns are `agent`, `sample`, `time_s` (s), `setpoint` (degC), and four columns each
+    for the temperature, `output_...` (degC), and the applied flow, `applied_...` (t/h): `run`
+    is the first run, and `median`, `p10` and `p90` are percentiles over all runs of all
+    members. If the set points are random, the percentiles are those of the first run.
+
+    Parameters
+    ----------
+    trajectories
+        The signals of a batch of runs for each member of the controller.
+    scenario
+        The scenario.
+    agent
+        The name of the controller in options.
     """
     setpoint = trajectories[0].setpoint[:, 0]
     k = np.arange(len(setpoint))
@@ -110,7 +140,8 @@ def _responses(
         columns[f"{signal}_run"] = values[:, 0]
         if scenario.parameters.setpoint == "random":
             values = values[:, :1]
-        # Values that occurred: an interpolated applied flow could lie in the dead zone.
+        # The method "nearest" returns values that occurred: an interpolated percentile of the
+        # applied flow could lie in the dead zone.
         for name, percentile in percentiles(values, "nearest").items():
             columns[f"{signal}_{name}"] = percentile
     return pd.DataFrame(columns)
@@ -118,17 +149,16 @@ def _responses(
 
 @dataclass(frozen=True)
 class Scale:
-    """The bounds with which the errors in a scenario are compared.
+    """The least possible errors with which a report compares the errors in a scenario.
 
     Attributes
     ----------
     scenario : Scenario
         The scenario.
     least : LeastPossible
-        The least possible error, of the kind of bound that applies to the scenario.
+        The least possible error of a controller that does not know future set points.
     preview : float
-        The least possible mean error of a controller that knows all set points in advance,
-        degC.
+        The least possible error of a controller that knows all future set points, degC.
     """
 
     scenario: Scenario
@@ -137,10 +167,22 @@ class Scale:
 
 
 def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
-    """Return the bounds on the errors in a scenario: means over the episodes that are run.
+    """Return the least possible errors in a scenario, as means over episodes.
 
-    Run i has the seed `seed + i`. An error is raised if no controller can do better than an
-    idle valve.
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    runs
+        Number of runs. The means are over the episodes of these runs, but at most over
+        `EPISODES` episodes.
+    seed
+        Seed of the first run; run i has the seed `seed + i`.
+
+    Raises
+    ------
+    ValueError
+        If no controller can have a smaller error than an idle valve.
     """
     from benchmarks.bounds.least import (
         least_possible,
@@ -153,7 +195,7 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
         **scenario.arguments,
     }
     least = least_possible(**arguments)
-    least.score(0.0)  # This raises the error.
+    least.score(0.0)  # This raises a ValueError if an idle valve is as good as any controller.
     preview = least_possible(kind="preview", **arguments)
     return Scale(scenario, least, preview.value)
 
@@ -163,34 +205,37 @@ def estimate(
     scales: Mapping[str, Scale],
     anticipations: Anticipations = MappingProxyType({}),
 ) -> pd.DataFrame:
-    """Estimate the errors and the scores of controllers, with 95 % confidence intervals.
+    """Estimate the mean errors and the scores of controllers, with 95 % confidence intervals.
 
     Parameters
     ----------
     runs : pandas.DataFrame
-        A row for each run, with `scenario`, `agent`, `policy`, `seed` and `mae`. The agent of
-        the first row is the reference for the differences.
+        A row for each run, with the columns `scenario`, `agent` (the controller), `policy` (the
+        number of the member), `seed` and `mae` (the error of the run, degC). The controller in
+        the first row is the reference for differences.
     scales : mapping
-        The scale of each scenario by name. Scenarios without a scale are left out.
+        The least possible errors of each scenario, by the scenario's name. Other scenarios are
+        left out.
     anticipations : mapping
-        The anticipations of controllers.
+        The anticipation of each controller that acts before a square wave changes.
 
     Returns
     -------
     pandas.DataFrame
-        A row for each scenario and agent with these columns:
+        A row for each scenario and controller, with the columns `scenario`, `agent` and:
 
-        - `limit` and `preview`: the least possible errors without and with foresight, degC;
-        - `mean`: the mean of |e|, degC, an `Estimate`. If a quantity is random and there is
-          only one run, the ends of the interval are infinite;
-        - `ratio`: `mean` divided by `limit`, an `Estimate`;
-        - `scores`: the scores of the runs, shape (policies, runs). If the controller
-          anticipates changes, these are the scores where changes surprise;
-        - `mark`: "‡" if the controller anticipates changes, else "";
-        - `difference`: the mean difference of |e| from the reference in the same run, degC, an
-          `Estimate`;
-        - `improvement`: the share of runs with a smaller error than the reference, an
-          `Estimate`. An equal error counts as half a run.
+        - `limit` and `preview`: the least possible errors without and with knowledge of future
+          set points, degC;
+        - `mean`: the mean error over the runs, degC, an `Estimate`. If random numbers are used
+          and there is only one run, the ends of the interval are infinite;
+        - `ratio`: the error ratio, which is `mean` divided by `limit`, an `Estimate`;
+        - `scores`: an array with the score of each run, shape (policies, runs). If the
+          controller anticipates, the scores are those in surprising runs;
+        - `mark`: "‡" if the controller anticipates, and otherwise "";
+        - `difference`: the mean over the runs of the error minus the error of the reference in
+          the same run, degC, an `Estimate`;
+        - `improvement`: the share of the runs in which the error is smaller than the error of
+          the reference, an `Estimate`. A run with equal errors counts as half a run.
     """
     reference = runs["agent"].iloc[0]
     rows = []
@@ -231,7 +276,11 @@ def estimate(
 def misfits_of(
     controllers: Mapping[str, ControllerSpec], plants: Sequence[Parameters]
 ) -> dict[str, str]:
-    """Return the reason, in a sentence, for each controller that does not fit all plants."""
+    """Return why controllers do not fit some plant: a sentence by the name of the controller.
+
+    Controllers that fit all plants are left out. `controllers` are records by name, and
+    `plants` are the plants of all scenarios.
+    """
     misfits: dict[str, str] = {}
     for name, controller in controllers.items():
         for plant in plants:
@@ -242,10 +291,17 @@ def misfits_of(
 
 
 def ranked(estimates: pd.DataFrame, misfits: Collection[str] = ()) -> dict[str, Estimate]:
-    """Return the overall score of each agent, the best agent first and `misfits` last.
+    """Return the overall score of each controller, by name, in the order of the ranking.
 
-    The overall score is the mean over the scenarios. Its 95 % confidence interval resamples
-    policies and runs within each scenario.
+    The overall score is the mean score over scenarios, members (the trained networks of a
+    controller) and runs. Its 95 % confidence interval is that of `bootstrap`.
+
+    Parameters
+    ----------
+    estimates
+        The table of `estimate`.
+    misfits
+        The names of controllers that do not fit all plants, which come last.
     """
     scores = {
         str(agent): bootstrap(*tables, seed=BOOTSTRAP_SEED)
@@ -255,7 +311,11 @@ def ranked(estimates: pd.DataFrame, misfits: Collection[str] = ()) -> dict[str, 
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return percentiles over the runs, with a row for each scenario, agent and measure."""
+    """Return the percentiles over runs, with a row for each scenario, controller and measure.
+
+    `runs` is a table as in `Result`. The columns of the returned table are `scenario`, `agent`,
+    `metric` (the name of the measure), `runs` (their number), `median`, `p10` and `p90`.
+    """
     measures = runs.columns.drop(["scenario", "agent", "policy", "seed"])
     rows = []
     for (scenario, agent), group in runs.groupby(["scenario", "agent"], sort=False):
@@ -266,10 +326,11 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
-    """Write a table of numbers, texts and estimates as a CSV file.
+    """Write a table of numbers, texts and objects of class `Estimate` to the CSV file `path`.
 
-    An estimate becomes three columns: its value, and the ends of its interval, which are empty
-    if they are unknown. An infinite number, which is a settling time, becomes "not settled".
+    A column of estimates becomes three columns: NAME has the values, and NAME_low and NAME_high
+    have the ends of the intervals, with empty cells for infinite ends. Infinity in any other
+    column, which is the settling time of a run that does not settle, becomes "not settled".
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():

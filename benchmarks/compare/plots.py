@@ -1,4 +1,8 @@
-"""Draw the pictures of a comparison; the title of a picture states what its data show."""
+"""Draw the pictures of a comparison of controllers.
+
+The title of a picture is a sentence on the results in the picture, such as which controller has
+the highest score. A score is 0 for an idle valve and 1 for the least possible error.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,8 @@ from benchmarks.lib.statistics import Estimate, written
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 
-# The ends of the axis of scores. Scores beyond an end are drawn at the end.
+# The ends of the axis of scores, which is logarithmic in 1 minus the score, so that it cannot
+# reach 1. Scores beyond an end are drawn at the end.
 LOWEST_SCORE = -0.5
 HIGHEST_SCORE = 0.999
 SCORE_TICKS = LOWEST_SCORE, 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, HIGHEST_SCORE
@@ -28,19 +33,23 @@ SCORE_LABEL = (
     "score: 0 = idle valve, 1 = least possible error (axis logarithmic in 1 minus the score)"
 )
 
-BAND: Any = {"alpha": 0.3, "linewidth": 0}  # the 10th to 90th percentile of the runs
+# The look of the band from the 10th to the 90th percentile of the runs.
+BAND: Any = {"alpha": 0.3, "linewidth": 0}
 
 MARKER_SIZE = 6.0  # points
 MARKER_SIZES = {"*": 8.0, "D": 5.0}  # points; these markers then look as large as the others
 
 
 def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: Path) -> None:
-    """Draw the overall score of each controller in a row, and its score in each scenario.
+    """Draw the scores of controllers: a row for each controller, on a common axis of scores.
+
+    A row has a large marker at the overall score of the controller, and a small tick at the
+    controller's score in each scenario.
 
     Parameters
     ----------
     scores : mapping
-        The overall score of each controller, the best first.
+        The overall score of each controller by name, the highest score first.
     estimates : pandas.DataFrame
         A row for each scenario and controller, as `comparison.estimate` returns it.
     path : Path
@@ -73,9 +82,9 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
 
 
 def scores_finding(scores: Mapping[str, Estimate]) -> str:
-    """Return a sentence that names the controllers with the highest and lowest scores.
+    """Return the title of the picture of scores: who has the highest and the lowest score.
 
-    `scores` are the scores of the controllers, the highest first.
+    `scores` has the overall score of each controller by name, the highest score first.
     """
     names = [label(agent) for agent in scores]
     values = [written(score.value, ".3f") for score in scores.values()]
@@ -89,7 +98,10 @@ def scores_finding(scores: Mapping[str, Estimate]) -> str:
 
 
 def marks_of(agents: Sequence[str]) -> dict[str, Any]:
-    """Return the arguments of `Axes.plot` that draw the marker of each controller."""
+    """Return keyword arguments of `Axes.plot` that draw the marker of a controller, by name.
+
+    `agents` are the names of the controllers in options.
+    """
     marks = {}
     for agent, (colour, marker) in looks(agents).items():
         size = MARKER_SIZES.get(marker, MARKER_SIZE)
@@ -98,14 +110,18 @@ def marks_of(agents: Sequence[str]) -> dict[str, Any]:
 
 
 def distance(scores: ArrayLike) -> NDArray[np.float64]:
-    """Return 1 minus each score. A score beyond the axis is first moved to its end."""
+    """Return 1 minus each score, for the logarithmic axis; the shape is that of `scores`.
+
+    A score beyond an end of the axis of scores is replaced by the score at this end.
+    """
     return 1.0 - np.clip(scores, LOWEST_SCORE, HIGHEST_SCORE)
 
 
 def _scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
-    """Make the x axis of `distance(scores)` logarithmic, and label its ticks by scores.
+    """Make the x axis of `axes` logarithmic in 1 minus the score, and label ticks with scores.
 
-    `scores` are all scores that are drawn.
+    `scores` has all scores that are drawn. If a score lies beyond an end of the axis, the label
+    at this end begins with "<" or ">".
     """
     labels = [f"{score:g}" for score in SCORE_TICKS]
     if min(scores) < LOWEST_SCORE:
@@ -123,16 +139,19 @@ def _scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
 def plot_responses(
     responses: pd.DataFrame, errors: pd.Series[float], scenario: Scenario, path: Path
 ) -> None:
-    """Draw temperature and flow over a run in a row for each controller, the best first.
+    """Draw the temperature and the flow over time, in a row of panels for each controller.
+
+    The controller with the smallest mean error has the top row.
 
     Parameters
     ----------
     responses : pandas.DataFrame
-        A row for each controller and sample, as in `comparison.Result`.
+        The table `responses` of `comparison.Result`, of all controllers to draw: a row for each
+        controller and sample.
     errors : pandas.Series
-        Mean error of each controller, degC.
+        Mean error of each controller in the scenario, degC, by the controller's name.
     scenario : Scenario
-        The scenario.
+        The scenario in which the controllers ran.
     path : Path
         The PNG file.
     """
@@ -158,9 +177,10 @@ def plot_responses(
 
 
 def responses_finding(errors: pd.Series[float]) -> str:
-    """Return a clause that compares the controllers with the smallest and the largest error.
+    """Return a clause of a title that compares the smallest and the largest mean error.
 
-    `errors` are the mean errors of the controllers in rising order, degC.
+    `errors` has the mean error of each controller, degC, by the controller's name, in rising
+    order.
     """
     best = str(errors.index[0])
     worst = str(errors.index[-1])
@@ -171,9 +191,16 @@ def responses_finding(errors: pd.Series[float]) -> str:
 
 
 def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
-    """Draw the set point, the output of the first run, and a band with most of the runs.
+    """Draw the set point, the temperature of the first run, and a band of percentiles.
 
-    `rows` are the responses of one controller.
+    Parameters
+    ----------
+    axes
+        The panel of the temperature of one controller.
+    rows
+        The rows of `responses`, an argument of `plot_responses`, with this controller.
+    colour
+        The colour of the controller.
     """
     minutes = rows["time_s"] / 60.0
     axes.fill_between(minutes, rows["output_p10"], rows["output_p90"], color=colour, **BAND)
@@ -185,7 +212,17 @@ def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
 def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -> None:
     """Draw the applied flow of the first run, the dead zone, and the limits of the flow.
 
-    If the dead zone has a range, the smallest one is drawn; of the limits, the widest.
+    Parameters
+    ----------
+    axes
+        The panel of the flow of one controller.
+    rows
+        The rows of `responses`, an argument of `plot_responses`, with this controller.
+    colour
+        The colour of the controller.
+    plant
+        The arguments of the environment. If the dead zone or a limit has a range, the smallest
+        dead zone or the widest limit is drawn.
     """
     dead_zone = plant.range_of("dead_zone")[0]
     axes.axhspan(-dead_zone, dead_zone, **DEAD_ZONE)
@@ -197,7 +234,11 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
 
 
 def _legend_of_responses(responses: pd.DataFrame, plant: Parameters) -> dict[str, Any]:
-    """Return the entries of the legend: an artist for each text."""
+    """Return the lines and patches that the legend shows, by their texts.
+
+    `responses` is the argument of `plot_responses`, and `plant` has the arguments of the
+    environment.
+    """
     runs_differ = bool((responses["output_p90"] > responses["output_p10"]).any())
     run = Line2D([], [], color="black", linewidth=1.2)
     band = Patch(color="black", **BAND)

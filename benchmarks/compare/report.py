@@ -1,4 +1,4 @@
-"""Write the tables, pictures and report of a comparison."""
+"""Write the tables, pictures and report of a comparison of controllers in scenarios."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -71,26 +71,29 @@ PARTS = {  # the columns of a part of the mean error, and of the mean error
 
 @dataclass(frozen=True)
 class Comparison:
-    """All results of a comparison in the scenarios whose least possible error is known.
+    """All results of a comparison that the report shows.
+
+    The scenarios are those whose least possible error has been computed.
 
     Attributes
     ----------
     controllers : mapping
-        The records of the controllers by name.
+        The record of each controller by name.
     results : sequence of Result
-        A result for each scenario and controller that has finished.
+        The results of each controller in each scenario, as far as these tasks have finished.
     scales : mapping
-        The scale of each scenario by name.
+        The least possible errors in each scenario, by the name of the scenario.
     runs : pandas.DataFrame
-        A row for each run in these scenarios.
+        A row for each run in the scenarios, as in `comparison.Result`.
     estimates : pandas.DataFrame
         A row for each scenario and controller, as `comparison.estimate` returns it.
     anticipations : mapping
-        The controllers that anticipate changes of the set point.
+        The anticipation of each controller that acts before a square wave changes, by the names
+        of scenario and controller.
     misfits : mapping
-        The reasons why controllers do not fit the plants, by name.
+        Sentences that say why a controller does not fit a plant, by the controller's name.
     scores : mapping
-        The overall score of each controller, the best first and the misfits last.
+        The overall score of each controller by name, the best first and the misfits last.
     """
 
     controllers: Mapping[str, ControllerSpec]
@@ -110,10 +113,21 @@ def write(
     folder: Path,
     origin: Mapping[str, Any],
 ) -> None:
-    """Write the numbers, pictures and report of a comparison, and print the main tables.
+    """Write the CSV files, pictures and report of a comparison, and print the main tables.
 
-    A scenario without a scale, whose bounds could not be computed, is in the numbers only.
-    `origin` is the provenance of the results.
+    Parameters
+    ----------
+    results
+        The results of each controller in each scenario.
+    scales
+        The least possible errors of the scenarios. A scenario whose least possible errors are
+        missing is in the CSV files, but not in the report.
+    controllers
+        The record of each controller by name.
+    folder
+        The folder to write to.
+    origin
+        The provenance of the results, as `provenance.origin` returns it.
     """
     runs = pd.concat([result.runs for result in results], ignore_index=True)
     write_numbers(folder / "runs.csv", runs)
@@ -154,9 +168,21 @@ def write(
 
 
 def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:
-    """Draw the scores, and the responses of some controllers in each scenario.
+    """Draw the scores, and the temperature and flow over time in each scenario.
 
-    `responses` are the responses of all controllers by the name of the scenario.
+    Controllers that do not fit the plants have no scores in the picture. Temperature and flow
+    are drawn for the controllers whose record has `pictured` true, or for all controllers if
+    there is no such record.
+
+    Parameters
+    ----------
+    comparison
+        The results.
+    responses
+        The tables `responses` of `comparison.Result` for all controllers, by the name of the
+        scenario.
+    folder
+        The folder of the PNG files.
     """
     from benchmarks.compare import plots  # imported here, as matplotlib is slow to import
 
@@ -177,7 +203,7 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
 
 
 def sections(comparison: Comparison) -> list[Section]:
-    """Return the sections of the report that have anything to show."""
+    """Return the sections of the report whose tables have at least one row."""
     reference = label(str(comparison.runs["agent"].iloc[0]))
     first_scale = next(iter(comparison.scales.values()))
     titles = {name: scale.scenario.title for name, scale in comparison.scales.items()}
@@ -239,7 +265,7 @@ def sections(comparison: Comparison) -> list[Section]:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return sentences on controllers that are not ranked, or not ranked by their own runs."""
+    """Return sentences on controllers that are not ranked, or ranked by surprising runs."""
     texts = {
         str(policy["note"])
         for result in comparison.results
@@ -261,10 +287,18 @@ def score_table(
     scores: Mapping[str, Estimate],
     misfits: Collection[str] = (),
 ) -> pd.DataFrame:
-    """Return the scores and the mean valve travel, with a row for each controller.
+    """Return a table of texts with the scores and the mean valve travel of each controller.
 
-    `scores` are the overall scores in the order of the rows. Controllers in `misfits` get no
-    overall score.
+    Parameters
+    ----------
+    runs
+        A row for each run, as in `comparison.Result`.
+    estimates
+        The table of `comparison.estimate`.
+    scores
+        The overall score of each controller by name, in the order of the rows of the result.
+    misfits
+        The names of controllers that do not fit the plants, which are shown as "not ranked".
     """
     agents = list(scores)
     cells = estimates["scores"].map(lambda scores: written(scores.mean(), ".2f"))
@@ -281,7 +315,20 @@ def score_table(
 def ratio_table(
     estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
 ) -> pd.DataFrame:
-    """Return the least possible errors, and below them the error ratio of each controller."""
+    """Return a table of texts with least possible errors and error ratios in each scenario.
+
+    The first two rows have the least possible errors without and with knowledge of future set
+    points, degC. The other rows have the error ratios of the controllers.
+
+    Parameters
+    ----------
+    estimates
+        The table of `comparison.estimate`.
+    scales
+        The least possible errors in each scenario, by the name of the scenario.
+    agents
+        The names of the controllers, in the order of the rows.
+    """
     bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
     for name, scale in scales.items():
         mark = "*" if scale.least.kind == "reference" else ""
@@ -291,7 +338,11 @@ def ratio_table(
 
 
 def anticipation_table(anticipations: Anticipations, estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return what controllers gain by moving before a square wave changes, in a row each."""
+    """Return a table of texts on the controllers that act before a square wave changes.
+
+    There is a row for each scenario and controller in `anticipations`. `estimates` is the table
+    of `comparison.estimate`.
+    """
     rows = []
     for row in estimates.to_dict("records"):
         anticipation = anticipations.get((row["scenario"], row["agent"]))
@@ -313,7 +364,12 @@ def anticipation_table(anticipations: Anticipations, estimates: pd.DataFrame) ->
 
 
 def difference_table(estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return the differences from the reference, and the shares of runs that are better."""
+    """Return a table of texts that compares the errors with those of the reference controller.
+
+    A cell has the mean difference of the errors, degC, and the share of the runs in which the
+    error is smaller than that of the reference. `estimates` is the table of
+    `comparison.estimate`. If there is only one controller, the result is empty.
+    """
     if "difference" not in estimates:
         return pd.DataFrame()
     compared = estimates.dropna(subset=["difference"])
@@ -326,9 +382,16 @@ def difference_table(estimates: pd.DataFrame) -> pd.DataFrame:
 
 
 def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
-    """Return a table of texts, with a row for each agent and a column for each scenario.
+    """Return a table of texts, with a row for each controller and a column for each scenario.
 
-    `rows` have the scenario and the agent of each of the `cells`.
+    Parameters
+    ----------
+    rows
+        A table with the columns `scenario` and `agent` (the controller), one row for each cell.
+    cells
+        The texts of the cells, in the order of `rows`.
+    agents
+        The names of the controllers, in the order of the rows of the result.
     """
     table = rows.assign(cell=cells).pivot(index="agent", columns="scenario", values="cell")
     table = table.loc[list(agents), rows["scenario"].unique()].fillna("").rename(index=label)
@@ -336,7 +399,11 @@ def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataF
 
 
 def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the parts of the mean error of each controller in the scenario `hard`, degC."""
+    """Return a table of texts with the parts of the mean error in the scenario `hard`, degC.
+
+    `PARTS` has the parts. There is a row for each controller, the smallest mean error first.
+    `runs` has a row for each run, as in `comparison.Result`.
+    """
     means = runs[runs["scenario"] == "hard"].groupby("agent")[list(PARTS)].mean()
     texts = means.sort_values("mae").map("{:.3f}".format)
     return texts.rename(index=label, columns=PARTS).rename_axis("controller").reset_index()
@@ -345,9 +412,16 @@ def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
 def costs_table(
     results: Sequence[Result], controllers: Mapping[str, ControllerSpec], scenario: Scenario
 ) -> pd.DataFrame:
-    """Return the knowledge, robustness and costs, with a row for each controller.
+    """Return a table of texts on knowledge, robustness and costs, a row for each controller.
 
-    The robustness of a linear controller is that with the nominal plant of the scenario.
+    Parameters
+    ----------
+    results
+        The results of each controller in each scenario, which have the processor times.
+    controllers
+        The record of each controller by name, in the order of the rows.
+    scenario
+        The scenario for whose nominal plant the robustness of linear controllers is computed.
     """
     rows = []
     for name, controller in controllers.items():
@@ -369,9 +443,11 @@ def costs_table(
 
 
 def robustness(controller: ControllerSpec, scenario: Scenario) -> tuple[str, str]:
-    """Return the Ms and the stable delays of a controller's loop as texts.
+    """Return two texts on the robustness of a controller's loop, or two empty texts.
 
-    The delays are in samples. Both texts are "" if the controller is not linear.
+    The first text is Ms, the maximum sensitivity of the loop with the nominal plant of the
+    scenario, and the second text is the range of the delays, in samples, with which the loop is
+    stable. If the controller is not linear, both texts are empty.
     """
     if not controller.linear:
         return "", ""

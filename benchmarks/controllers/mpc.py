@@ -1,6 +1,8 @@
-"""Implement a predictive controller that knows all of the plant and actuator but the future.
+"""Implement model predictive control (MPC) with an exact model of the plant and the actuator.
 
-Its errors show how close a controller can come to the bounds of `benchmarks.bounds`.
+The controller knows all parameters of the plant, the noise and the load, but no future noise,
+loads and set points. The errors of the controller show how close a controller can come to the
+error bounds of `benchmarks.bounds`.
 """
 
 from dataclasses import dataclass
@@ -18,30 +20,29 @@ from mptc_gym.signals import LOAD_INTERVAL, Levels
 
 Array = NDArray[np.float64]
 
-HORIZON = 5  # flows in a plan; the first is applied, then all are planned again
-SWEEPS = 100  # the largest number of sweeps of coordinate descent
+HORIZON = 5  # flows in a plan, one a sample; the first flow is applied, then all are replanned
+SWEEPS = 100  # limit of the sweeps of coordinate descent, to bound the time of a sample
 TOLERANCE = 1e-4  # t/h; coordinate descent stops if a sweep changes no flow by this much
 TINY = 1e-9  # added to variances, degC^2, and to divisors, so that none of them is 0
-WARM_UP = 200  # samples until the covariance of the filter hardly changes
+WARM_UP = 200  # samples until the covariance of the Kalman filter hardly changes
 
 
 @dataclass(frozen=True)
 class _Model:
-    """The plants in the step to a sample, and what a plan of flows does to their outputs.
-
-    `n` is the number of runs.
+    """The plants of n runs at one sample, and the effect of planned flows on the outputs.
 
     Attributes
     ----------
     plants : LinearModel
         The plants of all runs.
     response : Array
-        G, shape (n, HORIZON, HORIZON): the changes of the outputs by the planned flows,
-        `outputs = G flows`, degC per t/h.
+        The matrix G, shape (n, HORIZON, HORIZON), degC per t/h. G times the planned flows is
+        the change of the first HORIZON outputs that these flows can affect.
     hessian : Array
-        G' G, shape (n, HORIZON, HORIZON).
+        The product of the transpose of G and G, shape (n, HORIZON, HORIZON).
     rows : Array
-        G' G with the runs last, shape (HORIZON, HORIZON, n), which is quick to loop over.
+        `hessian` with the axis of the runs last, shape (HORIZON, HORIZON, n): operations on all
+        runs are faster in this order.
     """
 
     plants: LinearModel
@@ -51,7 +52,7 @@ class _Model:
 
     @classmethod
     def of(cls, plants: LinearModel) -> "_Model":
-        """Return the model of these plants."""
+        """Return the model of `plants`, the plants of all runs at one sample."""
         impulse_response = plants.impulse_response(HORIZON)
         response = np.zeros((len(impulse_response), HORIZON, HORIZON))
         for j in range(HORIZON):
@@ -61,10 +62,18 @@ class _Model:
         return cls(plants, response, hessian, rows)
 
     def cost(self, plan: Array, slopes: Array) -> Array:
-        """Return the cost of a plan for each run, but for a constant, shape (n,), degC^2.
+        """Return the cost of a plan in each of n runs, degC^2, shape (n,).
 
-        `plan` are flows, t/h, and `slopes` are G' (target - free outputs), both of shape
-        (HORIZON, n).
+        The cost is half the sum of squared differences between the targets and the outputs with
+        the plan, without the part of the sum that does not depend on the plan.
+
+        Parameters
+        ----------
+        plan
+            The planned flows, t/h, shape (HORIZON, n).
+        slopes
+            The transpose of G times the differences between the targets and the outputs that
+            are expected without the planned flows, shape (HORIZON, n).
         """
         quadratic = np.einsum("in,nij,jn->n", plan, self.hessian, plan) / 2.0
         return np.asarray(quadratic - (slopes * plan).sum(axis=0))
@@ -73,28 +82,33 @@ class _Model:
 class PredictiveController:
     """Plan, at each sample, the flows that bring the expected output to the set point.
 
-    The controller knows A, B, C and d of the plant (28) and the course of their drift, even if
-    run i draws them with the seed `seed + i`. A Kalman filter estimates the output, xi and the
-    load from the transmitter's readings. The jumps of the load are not normal; for them, it is
-    the best linear filter.
+    The controller knows the polynomials A, B and C and the delay d of the plant, equation (28)
+    of the paper, and how A and B drift, even if the plant is random and differs from run to
+    run. A Kalman filter estimates the output, the white noise xi and the load from the
+    transmitter's readings. The load jumps, so the load is not normally distributed; the Kalman
+    filter is then still the best linear filter.
 
-    The score depends on the mean of |e|, so the expected outputs are medians, and the load is
-    expected not to change. The plan minimises the sum of squared differences between the
-    expected outputs and the outputs to aim at, over the samples that the planned flows reach
-    first, for flows within the limits. A first flow inside the dead zone is replaced by 0 or by
-    the flow of a command on the edge of the dead zone, whichever gives the better plan.
+    The score depends on the mean of |e|, the absolute error. So the expected outputs are
+    medians, and the load is expected to stay as it is. The planned flows minimise the sum of
+    squared differences between the expected outputs and the target outputs, for flows within
+    the limits of the actuator. The sum is over the first HORIZON outputs that the planned flows
+    can affect. A first planned flow inside the dead zone is replaced by 0 or by the flow at the
+    edge of the dead zone, whichever gives the plan with the smaller sum.
 
-    The output to aim at is the set point, as if it never changed. If set points are random, the
-    age of a level tells how likely a change is before a flow shows; see `agents.hedge`.
+    The target outputs are equal to the present set point, as if the set point never changed. If
+    the environment draws set points at random, the time since the latest set-point change shows
+    how likely the set point is to change within the delay, and `agents.hedge` computes the
+    target outputs.
 
     Parameters
     ----------
     parameters : Parameters
         All arguments of the environment.
     num_envs : int
-        Number of runs.
+        Number of runs in the batch.
     seed : int
-        Seed of the first run.
+        Seed of the first run: the controller knows the plant numbers that the environment draws
+        for run i with the seed `seed + i`.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:
@@ -102,8 +116,8 @@ class PredictiveController:
         self._num_envs = num_envs
         self._numbers = drawn_numbers(parameters, num_envs, seed)
         self._delay = self._numbers.delay.astype(np.intp)
-        # Where the load may change, with the probability p, a level x becomes (1 - p) x in the
-        # mean. The variance of the levels is the same before and after.
+        # At each sample at which the load may step, it steps with the probability p. A load of
+        # x degC then becomes (1 - p) x in the mean; the variance of the load stays the same.
         interval = self._numbers.disturbance_interval
         self._load_stays = 1.0 - np.minimum(LOAD_INTERVAL / interval, 1.0)
         load_variance = (
@@ -116,7 +130,8 @@ class PredictiveController:
         # The state: y(k), y(k-1), ...; xi(k), xi(k-1), ...; the steps of the load and its walk.
         self._n_y = max(len(parameters.a) - 1, 1)
         self._size = self._n_y + len(parameters.c) - 1 + 2
-        # For each sample from k on and each b, the index of the input that shows; 0 for none.
+        # For each output from y(k) on and each coefficient of B: the index, in `_inputs`, of
+        # the flow that the coefficient multiplies; 0 for flows from u(k) on, not yet decided.
         ahead = np.arange(int(self._delay.max()) + HORIZON + 1)[:, np.newaxis]
         lag = np.arange(len(parameters.b)) + 1
         self._shows = (self._delay[:, np.newaxis, np.newaxis] + lag - ahead).clip(0)
@@ -130,7 +145,7 @@ class PredictiveController:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the episode: the plant is at rest."""
+        """Prepare for a new episode: forget all readings and flows, as the plant is at rest."""
         n = self._num_envs
         self._k = 0
         self._state = np.zeros((n, self._size))
@@ -139,11 +154,15 @@ class PredictiveController:
         longest_memory = int(self._delay.max()) + len(self._parameters.b)
         self._inputs = np.zeros((n, 1 + longest_memory))
         self._plan = np.zeros((HORIZON, n))
-        self._setpoint = np.full(n, np.nan)  # the latest one, degC
+        self._setpoint = np.full(n, np.nan)  # the latest set point, degC
         self._age = np.zeros(n, np.intp)  # samples since the set point changed
 
     def act(self, observation: Array) -> NDArray[np.float32]:
-        """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
+        """Return the actions of a sample, from -1 to 1, shape (runs, 1).
+
+        `observation` has the observations of the environment, shape (runs, elements): the
+        latest set points, degC, newest first, and then the latest errors, degC.
+        """
         observation = np.asarray(observation, dtype=np.float64)
         setpoint = observation[:, 0]
         if self._k > 0:
@@ -177,9 +196,10 @@ class PredictiveController:
         return action[:, np.newaxis]
 
     def _aims(self, setpoint: Array) -> Array:
-        """Return the outputs to aim at when the planned commands show, degC.
+        """Return the target outputs, degC, shape (runs, HORIZON); called once a sample.
 
-        `setpoint` has the shape (runs,), and the result has the shape (runs, HORIZON).
+        Column i has the target of the output that the planned flow i is the first to affect.
+        `setpoint` has the present set points, degC, shape (runs,).
         """
         if self._random is None:
             return np.broadcast_to(setpoint[:, np.newaxis], (len(setpoint), HORIZON))
@@ -193,10 +213,10 @@ class PredictiveController:
         )
 
     def _forecast_deviation(self) -> Array:
-        """Return the standard deviation of the first output that a new command reaches, degC.
+        """Return the standard deviation of the forecast error of each run, degC, shape (runs,).
 
-        It is that of the best forecast from the readings of a plant that does not drift, once
-        the filter has settled. The shape is (runs,).
+        The forecast is of the first output that a new command affects. The Kalman filter is
+        taken to have settled, and the plant is taken not to drift.
         """
         self.reset()
         plants = self._model(0).plants
@@ -211,9 +231,9 @@ class PredictiveController:
         return np.sqrt(variance)
 
     def _filter(self, output: Array) -> None:
-        """Advance the state from k - 1 to k, and correct it with the reading y(k).
+        """Advance the Kalman filter from sample k - 1 to the present sample k.
 
-        `output` is the reading, degC, shape (runs,).
+        `output` has the transmitter's readings at sample k, degC, shape (runs,).
         """
         plants = self._model(self._k).plants
         F, Q = self._transition(self._k, plants)
@@ -224,10 +244,11 @@ class PredictiveController:
         self._state = state + gain * (output - state[:, 0])[:, np.newaxis]
 
     def _update_covariance(self, F: Array, Q: Array) -> Array:
-        """Advance the covariance of the state by a sample, and return the gain of its reading.
+        """Advance the Kalman filter's covariance by a sample, and return the filter's gain.
 
-        F is the state transition, and Q is the covariance of the process noise, both of shape
-        (runs, size, size). The gain has the shape (runs, size).
+        F is the state transition matrix, and Q is the covariance of the process noise, both of
+        shape (runs, size, size), where size is the length of the state. The gain is the factor
+        from the deviation of the reading to the correction of the state, shape (runs, size).
         """
         P = F @ self._covariance @ F.transpose(0, 2, 1) + Q
         variance = P[:, 0, 0] + self._numbers.measurement_noise_variance
@@ -236,9 +257,11 @@ class PredictiveController:
         return gain
 
     def _transition(self, k: int, plants: LinearModel) -> tuple[Array, Array]:
-        """Return the state transition from k - 1 to k, and the covariance of the process noise.
+        """Return the matrices F and Q of the Kalman filter for the step from k - 1 to k.
 
-        Both have the shape (runs, size, size).
+        F is the state transition matrix, and Q is the covariance of the process noise, both of
+        shape (runs, size, size), where size is the length of the state. `plants` has the
+        plants of all runs at sample k.
         """
         load_changes = k % LOAD_INTERVAL == 0
         steps, walk = self._size - 2, self._size - 1  # the parts of the load in the state
@@ -256,9 +279,10 @@ class PredictiveController:
         return F, np.einsum("nk,nik,njk->nij", variances, sources, sources)
 
     def _predict(self) -> Array:
-        """Return the outputs expected from k + 1 on without further commands, degC.
+        """Return the outputs that are expected if all flows from the present sample k on are 0.
 
-        The shape is (runs, longest delay + HORIZON).
+        Column i has the outputs y(k + 1 + i), degC, of all runs. The shape is
+        (runs, longest delay + HORIZON).
         """
         c = self._parameters.c
         runs = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
@@ -279,7 +303,10 @@ class PredictiveController:
         return np.stack(outputs[self._n_y :], axis=1)
 
     def _model(self, k: int) -> _Model:
-        """Return the model for the step to sample k."""
+        """Return the plants of all runs in the step from sample k - 1 to sample k, as a model.
+
+        Models are stored, since the plants change only every `DRIFT_INTERVAL` samples.
+        """
         first = 0
         if self._parameters.drifts:
             first = k // DRIFT_INTERVAL * DRIFT_INTERVAL
@@ -295,18 +322,21 @@ class PredictiveController:
         start: Array,
         first_flow: Array | float | None = None,
     ) -> Array:
-        """Return the plan with the least cost within the limits, by coordinate descent.
+        """Return the planned flows with the least cost, t/h, shape (HORIZON, runs).
+
+        The flows lie within the limits of the actuator. The method is coordinate descent.
 
         Parameters
         ----------
         model
-            The model of the plants, which defines the cost.
+            The plants, for which `_Model.cost` is minimised.
         slopes
-            The linear part of the cost; see `_Model.cost`.
+            The second argument of `_Model.cost`, shape (HORIZON, runs).
         start
-            The plan to start from, t/h. All plans have the shape (HORIZON, runs).
+            The planned flows with which the descent starts, t/h, shape (HORIZON, runs).
         first_flow
-            The first flow of the plan, t/h; None if it is free, too.
+            A fixed value of the first planned flow, t/h, shape (runs,) or one number for all
+            runs; None if the first flow is chosen like the other flows.
         """
         plan = start.copy()
         free = range(HORIZON)

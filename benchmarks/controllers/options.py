@@ -1,6 +1,8 @@
-"""Read the options that choose controllers: of the roster, or a user's own.
+"""Read the options that choose controllers, `--agents` and `--agent`.
 
-A user's own code runs in the tasks that need it, so that a fault in it costs no other task.
+`--agents` names controllers of this project, and `--agent` names a user's own controller. The
+user's code is loaded in the task that runs the controller, so that an error in the user's code
+does not stop other tasks.
 """
 
 import importlib.util
@@ -51,7 +53,21 @@ class ControllerOptions:
 
 
 def agent_names(option: str, names: Sequence[str]) -> list[str]:
-    """Return names of the roster without repetitions; a `UsageError` names unknown ones."""
+    """Return the names of controllers that a user has listed in an option, each once.
+
+    Parameters
+    ----------
+    option
+        The name of the option, such as "--agents", for the error message.
+    names
+        The listed names.
+
+    Raises
+    ------
+    UsageError
+        If a name is not that of a controller in `ROSTER`. For a name of an earlier version, the
+        message has the present name.
+    """
     for name in names:
         if name in RENAMED:
             raise UsageError(f"{option}: {name!r} is now called {RENAMED[name]!r}")
@@ -61,22 +77,22 @@ def agent_names(option: str, names: Sequence[str]) -> list[str]:
 def chosen(
     names: Sequence[str], user_controllers: Sequence[str] = ()
 ) -> dict[str, ControllerSpec]:
-    """Return the records of controllers by name.
+    """Return the records of the controllers that a user has chosen, by name.
 
     Parameters
     ----------
     names
-        Controllers of the roster, as in the option `--agents`.
+        Names of controllers in `ROSTER`: the words of the option `--agents`.
     user_controllers
-        A user's own controllers, in the form NAME=LOCATION of the option `--agent`. Several
-        locations under one name become the members of one controller.
+        A user's own controllers: the words of the option `--agent`, each in the form
+        NAME=LOCATION. Several locations with one name become the members of one controller.
 
     Raises
     ------
     UsageError
-        If there is no controller, a name is unknown or taken, or a location does not exist.
-        A module or a zip file is loaded by the method `members` of the record, which raises
-        the error if loading fails.
+        If no controller is chosen, a name is unknown or taken, or a location does not exist.
+        The code of a user's module or zip file is loaded later, by the method `members` of the
+        record, which raises a `UsageError` if loading fails.
     """
     if not (names or user_controllers):
         raise UsageError("--agents, --agent: name at least one controller")
@@ -91,7 +107,12 @@ def chosen(
 
 
 def _split(text: str) -> tuple[str, str]:
-    """Return the name and the location in a value of `--agent`; `UsageError` if one is bad."""
+    """Return NAME and LOCATION of a word `text` of the form NAME=LOCATION.
+
+    The word is a value of the option `--agent`. A `UsageError` is raised if the word has
+    another form, if the name is that of a controller in `ROSTER`, or if the location, a file or
+    a module, does not exist.
+    """
     name, _, location = text.partition("=")
     if name.lower() in ROSTER:
         raise UsageError(f"--agent: {text!r} must be {FORMS}; {name!r} is taken")
@@ -111,7 +132,12 @@ def _split(text: str) -> tuple[str, str]:
 
 
 def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
-    """Return the record of a user's own controller, a member for each location."""
+    """Return the record of a user's own controller called `name`.
+
+    The controller has one member for each location: LOCATION in NAME=LOCATION, the value of the
+    option `--agent`. A `UsageError` is raised if a JSON or NPZ file cannot be read, or if the
+    kinds of locations cannot be combined.
+    """
     suffixes = {Path(location).suffix for location in locations}
     if len(locations) > 1 and (".json" in suffixes or {".npz"} < suffixes):
         listed = " and ".join(locations)
@@ -140,7 +166,10 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
 
 
 def _with_searched_gains(name: str, file: Path) -> ControllerSpec:
-    """Return the controller with the gains in a file of `benchmarks.tune`."""
+    """Return the record of a controller with the gains in a file of `benchmarks.tune`.
+
+    `name` is the user's name for the controller, and `file` is the JSON file.
+    """
     content = json.loads(file.read_text(encoding="utf-8"))
     return replace(
         ROSTER[content["controller"]].with_gains(content["gains"]),
@@ -153,7 +182,11 @@ def _with_searched_gains(name: str, file: Path) -> ControllerSpec:
 
 
 def _with_trained_networks(name: str, files: Sequence[str]) -> ControllerSpec:
-    """Return the controller with the policies in files of `benchmarks.train ppo`."""
+    """Return the record of a controller with the policies in files of `benchmarks.train ppo`.
+
+    `name` is the user's name for the controller, and `files` are NPZ files with one policy
+    each.
+    """
     networks = {file: PolicyNetwork.load(Path(file)) for file in files}
     provenance = networks[files[0]].provenance
     samples = f"{provenance.get('steps', 0) / 1e6:.3g} M samples a policy"
@@ -170,16 +203,18 @@ def _with_trained_networks(name: str, files: Sequence[str]) -> ControllerSpec:
 
 @dataclass(frozen=True)
 class UserCode:
-    """The code at a location of `--agent`.
+    """A user's own controller, as loaded from a location that the option `--agent` names.
 
     Attributes
     ----------
     factory : callable
-        Returns a policy, or a policy and the environment that the policy acts in.
+        Returns a policy, or a tuple of a policy and the environment that the policy acts in.
     observation : mapping
-        The windows of the observation, by the environment's arguments.
+        How many samples of each signal the policy observes, by the environment's arguments,
+        such as `{"error_window": 3}`.
     provenance : mapping
-        What the report says about the controller.
+        Texts for the report: "knows" (the prior knowledge), "searched" (the training) and
+        "note" (a remark), each of which may be missing.
     """
 
     factory: Callable[..., Any]
@@ -188,7 +223,11 @@ class UserCode:
 
 
 def _load_all(locations: Sequence[str]) -> dict[str, UserCode]:
-    """Return the code at each location; a `UsageError` names a location that is faulty."""
+    """Load a user's controllers, and return the loaded controllers by location.
+
+    `locations` are texts MODULE:FACTORY or ALGORITHM:FILE.zip. A `UsageError` names a location
+    whose code raises an error.
+    """
     codes = {}
     for location in locations:
         load = _load_zip if location.endswith(".zip") else _import_factory
@@ -201,7 +240,11 @@ def _load_all(locations: Sequence[str]) -> dict[str, UserCode]:
 
 
 def _import_factory(location: str) -> UserCode:
-    """Import MODULE:FACTORY; the README of `benchmarks.compare` describes a factory."""
+    """Import the user's function at the location MODULE:FACTORY.
+
+    `benchmarks/compare/README.md` describes the arguments, the result and the attributes of
+    this function. A ValueError is raised if the attribute `observation` has an unknown name.
+    """
     factory: Any = pkgutil.resolve_name(location)
     observation = dict(getattr(factory, "observation", PAPER_WINDOWS))
     if not set(observation) <= set(WINDOWS):
@@ -212,9 +255,10 @@ def _import_factory(location: str) -> UserCode:
 
 
 def _load_zip(location: str) -> UserCode:
-    """Load ALGORITHM:FILE.zip, a model of Stable-Baselines3.
+    """Load a model of Stable-Baselines3 from the location ALGORITHM:FILE.zip.
 
-    A model acts in the environment that its file describes, or else in the plain environment.
+    If `mptc_gym.sb3.save` wrote the file, the file describes the environment that the model
+    acts in. Otherwise, the model acts in `MiddlePoint-v0` without wrappers.
     """
     import stable_baselines3  # imported here, as PyTorch takes seconds to load
 
@@ -237,7 +281,18 @@ def _load_zip(location: str) -> UserCode:
 
 
 def _build(*, network: UserCode, **prior_knowledge: Any) -> Any:
-    """Return a user's controller, made with the arguments that its factory accepts by name."""
+    """Return a user's controller, made by calling the user's factory.
+
+    Parameters
+    ----------
+    network
+        The loaded code. It takes the place of the trained network of other controllers, hence
+        the name of the argument.
+    prior_knowledge
+        What the controller may know about the plant: quantities by name. The factory is called
+        with the quantities that are among the parameters of the factory, or with all quantities
+        if the factory has `**kwargs`.
+    """
     accepted = inspect.signature(network.factory).parameters
     accepts_all = any(argument.kind is argument.VAR_KEYWORD for argument in accepted.values())
     arguments = {
@@ -263,8 +318,9 @@ class Policy:
     policy
         The policy.
     env
-        The environment that the policy acts in, or a function that makes one. None stands for
-        the environment that is saved with a model, or else for the plain environment.
+        The environment that the policy acts in, or a function that makes an environment. None
+        stands for the environment that was saved with a model of Stable-Baselines3, or for
+        `MiddlePoint-v0` without wrappers if no environment was saved.
     runs : int
         Number of runs in a batch.
     """
@@ -274,15 +330,28 @@ class Policy:
     runs: int
 
     def reset(self) -> None:
-        """Start an episode: `act` is then the function of observations that returns actions."""
+        """Begin an episode: set `act` to a function from observations to actions.
+
+        Observations have the shape (runs, elements), and actions have the shape (runs, 1).
+        """
         self.act = start(self.policy, self.runs)
 
     @contextmanager
     def opened(self, samples: int, **arguments: Any) -> Iterator[Any]:
-        """Yield the plants that the policy acts in, for episodes of `samples` samples.
+        """Yield a vector environment of `runs` plants with the wrappers that the policy needs.
 
-        `arguments` are the environment's. A `UsageError` is raised if the policy's own
-        environment has other parameters, or if the policy does not fit its observations.
+        Parameters
+        ----------
+        samples
+            Length of an episode, in samples.
+        arguments
+            Arguments of the environment that define the case.
+
+        Raises
+        ------
+        UsageError
+            If the policy brings its own environment and this environment has other parameters
+            than the case, or if the policy does not fit the observations.
         """
         env, env_arguments = self._environment({**arguments, "max_episode_steps": samples})
         with opened(env, self.runs, self.policy, **env_arguments) as plants:
@@ -294,9 +363,11 @@ class Policy:
             yield plants
 
     def _environment(self, arguments: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return an environment in a form that `opened` takes, and its arguments beyond that.
+        """Return the first argument of `opened`, and the keyword arguments of the environment.
 
-        `arguments` are those of `gymnasium.make`.
+        The first argument is an environment, a function that makes one, an id or an `EnvSpec`.
+        `arguments` are the keyword arguments of `gymnasium.make` that define the case. The
+        returned arguments are `arguments`, or empty if the environment is already defined.
         """
         if self.env is not None:
             return self.env, {}

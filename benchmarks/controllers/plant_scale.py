@@ -1,4 +1,8 @@
-"""Compare the magnitudes of plants, and scale the gains of controllers between plants."""
+"""Compare the gains, time constants, delays and reachable temperatures of two plants.
+
+With the ratios of these four magnitudes, the intervals in which a search looks for the gains of
+a controller are converted from the paper's plant to another plant.
+"""
 
 import math
 from collections.abc import Mapping
@@ -7,9 +11,10 @@ from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 from mptc_gym.parameters import slowest_pole
 
-MUCH = 2.0  # Two plants differ if one of their magnitudes differs by more than this factor.
-PAPER = Parameters()
-# The intervals in which a search on the paper's plant looks for each gain.
+# Two plants count as different if one of the four magnitudes differs by more than this factor.
+MUCH = 2.0
+PAPER = Parameters()  # the paper's plant
+# The intervals in which a search on the paper's plant looks for each gain of a controller.
 PI_SPANS = {"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}
 NN_SPANS = {
     "eta": (1e-3, 10.0),
@@ -20,19 +25,22 @@ NN_SPANS = {
     "weight_scale": (0.05, 2.0),
 }
 
-Spans = Mapping[str, tuple[float, float]]  # the interval of each gain
+# The interval of each gain, by the gain's name: first the end of smaller magnitude.
+Spans = Mapping[str, tuple[float, float]]
 
 
 def direction(plant: Parameters) -> int:
-    """Return 1 if the temperature rises with the flow, and -1 otherwise."""
+    """Return 1 if the steady temperature of a plant rises with the flow, and -1 otherwise."""
     return 1 if nominal(plant).gain > 0.0 else -1
 
 
 def scales(plant: Parameters) -> dict[str, float]:
-    """Return four magnitudes of the nominal plant, by their name and unit.
+    """Return four magnitudes of the nominal plant, by a text of name and unit, "NAME, UNIT".
 
-    The reach is the change of the temperature by half the range of the flow. An integrating
-    plant has an infinite gain, reach and time constant.
+    The magnitudes are the gain, the reach (the change of the steady temperature by half the
+    range of the flow), the time constant and the delay. If the plant is integrating, the gain,
+    the reach and the time constant are infinite. The nominal plant is the plant in the middle
+    of all ranges of `plant`.
     """
     model = nominal(plant)
     gain = abs(float(model.gain))
@@ -50,9 +58,12 @@ def scales(plant: Parameters) -> dict[str, float]:
 
 
 def difference(plant: Parameters, made_for: Parameters) -> str:
-    """Return in words which magnitudes of two plants differ by a factor of more than `MUCH`.
+    """Return a text on the magnitudes of two plants that differ by a factor above `MUCH`.
 
-    The text is "" if no magnitude does.
+    The text has both values of each magnitude that differs, and is "" if no magnitude differs
+    by more than `MUCH`. The magnitudes are the gain, the reach, the time constant and the delay
+    that `scales` returns. `plant` is the plant on which a controller runs, and `made_for` is
+    the plant for which the controller was made.
     """
     expected = scales(made_for)
     parts = []
@@ -66,7 +77,11 @@ def difference(plant: Parameters, made_for: Parameters) -> str:
 
 
 def _finite_scales(plant: Parameters) -> dict[str, float]:
-    """Return `scales` of a plant; raise a ValueError if one is infinite, zero or negative."""
+    """Return the four magnitudes of `scales` for a plant on which gains are searched.
+
+    A ValueError is raised if one of the magnitudes is 0 or infinite, since the intervals of a
+    search are proportional to ratios of magnitudes.
+    """
     numbers = scales(plant)
     for name, value in numbers.items():
         if not 0.0 < value < math.inf:
@@ -78,10 +93,12 @@ def _finite_scales(plant: Parameters) -> dict[str, float]:
 
 
 def pi_spans(plant: Parameters) -> Spans:
-    """Return the intervals for gains of a PI on a plant: those on the paper's plant, scaled.
+    """Return the intervals in which a search looks for the gains `kp` and `ki` on a plant.
 
-    Both gains are inverse to the plant's gain, and have its sign. The integral gain `ki`, per
-    sample, is inverse to the time constant, too.
+    A PI controller has a proportional gain `kp` in t/h per degC, and an integral gain `ki` in
+    t/h per degC and sample. The intervals for the paper's plant are multiplied by the gain of
+    the paper's plant divided by the gain of `plant`. The interval of `ki` is also multiplied by
+    the time constant of the paper's plant divided by the time constant of `plant`.
     """
     numbers = _finite_scales(plant)
     paper_numbers = scales(PAPER)
@@ -93,10 +110,12 @@ def pi_spans(plant: Parameters) -> Spans:
 
 
 def nn_spans(plant: Parameters) -> Spans:
-    """Return the intervals for gains of the network: those on the paper's plant, scaled.
+    """Return the intervals in which a search looks for the gains of the paper's network.
 
-    The gain factors multiply an error and the input scale multiplies a temperature. Both are
-    inverse to the temperatures that the flow can reach. The initial weights have no unit.
+    The four gain factors of the learning rule multiply an error, and the input scale multiplies
+    temperatures. So the intervals for the paper's plant are multiplied by the ratio of the
+    temperature changes that the flow can cause on the paper's plant and on `plant`. The
+    interval for the initial weights, which have no unit, is the same for all plants.
     """
     reach = "reach of half the flow's range, °C"
     factor = scales(PAPER)[reach] / _finite_scales(plant)[reach]
@@ -105,7 +124,11 @@ def nn_spans(plant: Parameters) -> Spans:
 
 
 def dahlin_spans(plant: Parameters) -> Spans:
-    """Return the intervals for the time constants of Dahlin's controller on a plant, s."""
+    """Return the intervals in which a search looks for Dahlin's two time constants, s.
+
+    The intervals for the closed-loop and the filter time constant of Dahlin's controller are
+    fixed multiples of the time constant and the delay of `plant`.
+    """
     numbers = _finite_scales(plant)
     interval = plant.sampling_interval
     time_constant = numbers["time constant, samples"] * interval
@@ -117,7 +140,11 @@ def dahlin_spans(plant: Parameters) -> Spans:
 
 
 def _scaled(spans: Spans, factors: Mapping[str, float]) -> Spans:
-    """Return both ends of each interval times the factor of its gain."""
+    """Return intervals of gains with both ends multiplied by a factor.
+
+    `spans` has the interval of each gain, and `factors` has the factor of each gain, both by
+    the name of the gain.
+    """
     scaled = {}
     for name, (first, last) in spans.items():
         scaled[name] = first * factors[name], last * factors[name]

@@ -1,7 +1,7 @@
-"""List the controllers, with a record for each of them.
+"""List the controllers that the commands can run, as records of the class `ControllerSpec`.
 
-A controller that is added to this list is known to `compare`, `sweep`, `tune` and `watch`. The
-option `--agent NAME=MODULE:FACTORY` makes a record of a user's own controller.
+The commands `compare`, `sweep`, `tune` and `watch` can run each controller in this list. The
+option `--agent NAME=MODULE:FACTORY` makes a record for a user's own controller.
 """
 
 import itertools
@@ -39,7 +39,9 @@ from benchmarks.controllers.spec import (
 from benchmarks.loop.rollout import Agent, IdleValve
 from mptc_gym import PRESETS, Parameters
 
-LAMBDA = 0.1  # closed-loop time constant of Dahlin's controller / time constant of the plant
+# Default ratio of the closed-loop time constant of Dahlin's controller to the plant's time
+# constant. The small ratio makes the loop fast; the filter time constant makes it robust.
+LAMBDA = 0.1
 # The colours and markers that a user's own controllers get in turn.
 OWN_LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d")
 
@@ -47,35 +49,56 @@ OWN_LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d
 def with_bank(
     kind: type[SelfTuningController], *, widest_dead_zone: float, **prior_knowledge: Any
 ) -> SelfTuningController:
-    """Return a controller with a bank of models, made for the widest dead zone of the plant.
+    """Return a self-tuning controller, which selects the best of a bank of plant models.
 
-    `kind` is its class, and `widest_dead_zone` is in t/h. See `knowledge` for the other prior
-    knowledge.
+    Parameters
+    ----------
+    kind
+        The class of the controller.
+    widest_dead_zone
+        The largest half width of the dead zone that the plant can have, t/h. The controller
+        assumes this dead zone.
+    prior_knowledge
+        Other arguments of the class, as `benchmarks.controllers.spec.knowledge` returns them.
     """
     return kind(dead_zone=widest_dead_zone, **prior_knowledge)
 
 
 def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
-    """Return the paper's network, which has learnt on this plant and learns no more."""
+    """Return the paper's network, trained on a plant, with further learning switched off.
+
+    `parameters` are the arguments of the environment, `num_envs` is the number of runs in a
+    batch, and the initial weights of run i have the seed `seed + i`.
+    """
     controller: Any = ROSTER["nn"].in_service(asdict(parameters), num_envs, seed)
     controller.learning = False
     return controller  # type: ignore[no-any-return]
 
 
 def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
-    """Return Dahlin's controller; `time_constant` is that of the plant, s.
+    """Return Dahlin's controller for a plant.
 
-    Without the argument `closed_loop_time_constant`, it is a tenth of the plant's.
+    `time_constant` is the plant's time constant, s, and `arguments` are the other arguments of
+    `DahlinController`. The default of `closed_loop_time_constant` is `LAMBDA` times the plant's
+    time constant.
     """
     arguments.setdefault("closed_loop_time_constant", LAMBDA * time_constant)
     return DahlinController(time_constant=time_constant, **arguments)
 
 
 def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -> Agent:
-    """Return a trained policy for the limits of an actuator.
+    """Return a trained policy, adapted to the actuator of a plant.
 
-    If the policy compensates a dead zone, it compensates that of the plant. If the dead zone of
-    the plant has a range, the policy compensates that of its training.
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment. If the policy compensates a dead zone, and if the dead
+        zone of the plant is a single number, the policy compensates the plant's dead zone.
+        Otherwise, the policy is as it was in its training.
+    network
+        The trained policy.
+    limits
+        `u_min` and `u_max`, the limits of the actuator, t/h.
     """
     increments = network.increments
     dead_zone = parameters.dead_zone
@@ -85,9 +108,10 @@ def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -
 
 
 def trained(kind: type[PolicyNetwork | RecurrentNetwork], files: str) -> Mapping[str, Any]:
-    """Return the networks of a class whose files in `agents/pretrained` match a pattern.
+    """Return trained networks of the class `kind`, by the names of their files.
 
-    They are returned by the name of the file.
+    The files are those in the folder `agents/pretrained` whose names match the pattern `files`,
+    such as "ppo-*.npz".
     """
     return {file.name: kind.load(file) for file in PRETRAINED.glob(files)}
 
@@ -281,14 +305,18 @@ RENAMED = {
 
 
 def label(agent: str) -> str:
-    """Return the name of a controller in tables and pictures."""
+    """Return the name of a controller in tables and pictures, such as "MPC" for "mpc".
+
+    `agent` is the controller's name in options. A user's controller has only this name.
+    """
     return ROSTER[agent].label if agent in ROSTER else agent
 
 
 def looks(agents: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return the colour and the marker of each controller by its name.
+    """Return the colour and the marker, for matplotlib, of each controller by its name.
 
-    Controllers that are not in the roster get those of `OWN_LOOKS` in turn.
+    `agents` are the names of controllers in options. The controllers that are not in `ROSTER`,
+    which are a user's own, get the colours and markers of `OWN_LOOKS` in turn.
     """
     own_looks = itertools.cycle(OWN_LOOKS)
     looks = {}

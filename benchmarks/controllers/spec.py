@@ -1,4 +1,4 @@
-"""Define the record of a controller, and what a controller knows of a plant."""
+"""Define the record of a controller, and what a controller may know about a plant."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,11 +13,13 @@ from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from mptc_gym import Parameters
 from mptc_gym.signals import Levels
 
-LEARNING = 1200  # samples of the square wave in which a controller learns before its service
-COMMISSIONING_SEED = SEEDS["preparation"].first  # of the plants and noise of these samples
-ROBUSTNESS = 1.6  # Ms of the loop to which rules are tuned; the rule SIMC itself leads to 1.56
+LEARNING = 1200  # samples of the square wave in which a controller learns before it is measured
+COMMISSIONING_SEED = SEEDS["preparation"].first  # of the plants and noise of this learning
+# Ms, the maximum sensitivity of the loop, to which the time constant of a controller is chosen.
+# The rule SIMC without this choice leads to an Ms of 1.56.
+ROBUSTNESS = 1.6
 
-# What a controller may know of the plant, as names of `knowledge`.
+# Names of quantities that some controllers may know about the plant; see `knowledge`.
 LIMITS = "u_min", "u_max"
 DIRECTION = *LIMITS, "direction", "num_envs", "seed"
 STEP_TEST = *LIMITS, "gain", "time_constant", "delay", "sampling_interval"
@@ -28,19 +30,24 @@ EVERYTHING = "parameters", "num_envs", "seed"
 
 
 def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
-    """Return what a controller of a batch of runs knows of a plant, by name.
+    """Return what a controller may know about a plant, by the names of the quantities.
+
+    The values are arguments for the constructor of a controller.
 
     Parameters
     ----------
     names
-        Names of quantities: `parameters`, `num_envs`, `seed`, `u_min`, `u_max` and `dead_zone`
-        (t/h), `widest_dead_zone` (t/h), `delay_range` (s), `direction` (1 or -1), and those of
-        a step test.
+        Names of the quantities to return: `parameters` (all arguments of the environment),
+        `num_envs` (`runs`), `seed`, `u_min`, `u_max`, `dead_zone` and `widest_dead_zone` (t/h),
+        `delay_range` (s), `setpoint_holds` (s), `setpoint_amplitude` (degC), `direction` (the
+        sign of the gain, 1 or -1), and the results of `step_test`: `gain` (degC per t/h),
+        `time_constant`, `delay` and `sampling_interval` (s).
     plant
-        The plant. If quantities have ranges, a controller knows the widest limits, the middle
-        of the dead zone, and the step test of the plant in the middle of the ranges.
+        The plant. Where quantities of the plant have ranges, the limits are the widest limits,
+        the dead zone is the middle of its range, and the step test is that of the plant in the
+        middle of all ranges.
     runs
-        Number of runs in the batch.
+        Number of runs in a batch.
     seed
         Seed of the first run; run i uses the seed `seed + i`.
     """
@@ -62,7 +69,9 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
 def delay_range(plant: Parameters) -> tuple[float, float] | None:
     """Return the shortest and the longest delay of a plant, s; None if the delay is fixed.
 
-    They include the one sample that every input takes to show.
+    A delay is here the time from a flow to the first output that the flow can affect, so it is
+    one sample longer than the argument `delay` of the environment. The range of `plant.delay`
+    gives the two delays.
     """
     if not isinstance(plant.delay, Sequence):
         return None
@@ -72,7 +81,11 @@ def delay_range(plant: Parameters) -> tuple[float, float] | None:
 
 
 def setpoint_holds(plant: Parameters) -> tuple[float, float] | None:
-    """Return for how long a random set point is held, s; None if it is not random."""
+    """Return the shortest and the longest time for which a random set point is constant, s.
+
+    The result is None if the set point is not random. `plant` has the arguments of the
+    environment.
+    """
     levels = Levels(plant)
     if not levels.random:
         return None
@@ -81,59 +94,68 @@ def setpoint_holds(plant: Parameters) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSpec:
-    """The record of a controller: all that the commands need to know of it.
+    """The record of a controller: all that the commands need to run and describe it.
+
+    The nominal plant is the plant in the middle of the ranges of the environment's arguments.
 
     Attributes
     ----------
     name : str
-        Its name in options and files.
+        The name of the controller in options and files.
     label : str
-        Its name in tables and pictures.
+        The name of the controller in tables and pictures.
     look : tuple of str
-        Its colour and its marker in pictures. Related controllers have similar ones.
+        The colour and the marker of the controller in pictures, for matplotlib.
     build : callable
-        Returns the controller. Its arguments are the prior knowledge and the gains by name, and
-        a `network` if the record has `networks`.
+        Returns the controller. The keyword arguments are the prior knowledge, gains and time
+        constants by name, and also `network`, a trained network, if the record has `networks`.
     prior_knowledge : sequence of str
-        What the controller knows of the plant: names in `knowledge`.
+        What the controller knows about the plant: names of quantities that the function
+        `knowledge` returns.
     knows : str
         The prior knowledge in words, for tables.
     searched : str
         What was searched or trained beforehand, and in how many trials and samples, in words.
     tuned_by : str
         The argument of `build`, a time constant in s, that is chosen such that the loop with
-        the nominal plant has an Ms of `sensitivity`; "" if no argument is.
+        the nominal plant has a maximum sensitivity of `sensitivity`. "" if no argument is
+        chosen in this way.
     sensitivity : float
-        Ms, the largest magnitude of the loop's sensitivity function.
+        Ms, the largest magnitude of the sensitivity function of the loop.
     linear : bool
-        Whether the controller is linear away from the dead zone and the limits. Then it has a
-        method `transfer`.
+        Whether the controller is linear for commands outside the dead zone and within the
+        limits. A linear controller has a method `transfer`.
     assumes : sequence of str
-        What the controller takes for granted about the plant: its "direction", its "scale".
+        What has to agree between the plant and the plant that the controller was made for: the
+        "direction" (the sign of the gain) or the "scale" (the magnitudes of gain, reachable
+        temperature, time constant and delay).
     made_for : mapping
-        The plant that it was made for, by the environment's arguments.
+        The plant that the controller was made for, by the environment's arguments; empty for
+        the paper's plant.
     observation : mapping
-        The windows of its observation, by the environment's arguments.
+        How many samples of each signal the controller observes, by the environment's arguments,
+        such as `{"error_window": 3}`.
     networks : callable, optional
-        Returns the networks that were trained for the controller, by file. There is a member of
-        the controller for each of them.
+        Returns the networks that were trained for the controller, by file. The controller has
+        one member for each network, and a command runs all members.
     networks_are_alike : bool
-        Whether the networks hardly differ, so that most comparisons run the first one alone.
+        Whether the networks hardly differ, so that most comparisons run the first network only.
     random : bool
         Whether the controller draws random numbers, such as its initial weights.
     learns : bool
-        Whether the controller learns from run to run.
+        Whether the controller goes on learning from one run to the next.
     spans : callable, optional
-        Returns the interval in which a search looks for each gain, for a plant. An interval has
-        the value of the smallest and that of the largest magnitude, of the same sign.
+        Takes a plant, and returns the interval in which a search looks for each gain. An
+        interval begins with its end of smaller magnitude; both ends have the same sign.
     compared : bool
-        Whether `compare` runs the controller by default.
+        Whether the command `compare` runs the controller by default.
     swept : bool
-        Whether `sweep` runs the controller by default.
+        Whether the command `sweep` runs the controller by default.
     pictured : bool
-        Whether a comparison draws its responses.
+        Whether a comparison draws the temperature and the flow over time with the controller.
     provenance : mapping
-        Origin of the network of a member, JSON-serialisable; empty if nothing was trained.
+        The origin of the trained network of a member, as JSON can store it; empty if nothing
+        was trained.
     """
 
     name: str
@@ -160,9 +182,10 @@ class ControllerSpec:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def members(self) -> "list[ControllerSpec]":
-        """Return the record of a controller with each of the networks, in the order of files.
+        """Return a record for each network of the controller, in the order of the files' names.
 
-        Without networks, the list holds this record alone.
+        Each of the records builds the controller with one network. If the controller has no
+        networks, the list consists of this record.
         """
         if self.networks is None:
             return [self]
@@ -179,21 +202,35 @@ class ControllerSpec:
         return members
 
     def with_few_networks(self) -> "ControllerSpec":
-        """Return the record with the first network alone, if the networks are alike."""
+        """Return the record with only the first network, or this record if networks differ.
+
+        A controller whose `networks_are_alike` is false keeps all networks.
+        """
         networks = self.networks
         if networks is None or not self.networks_are_alike:
             return self
         return replace(self, networks=lambda: dict(sorted(networks().items())[:1]))
 
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
-        """Return the record of the controller with these arguments of `build`."""
+        """Return a record whose `build` always gets the arguments `gains`.
+
+        `gains` are arguments by name. If the time constant `tuned_by` is among the gains, the
+        value in `gains` replaces the value that `robust_time_constant` would choose.
+        """
         tuned_by = "" if self.tuned_by in gains else self.tuned_by
         return replace(self, build=partial(self.build, **gains), tuned_by=tuned_by)
 
     def make(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller of a batch of runs; run i uses the seed `seed + i`.
+        """Return a controller for a batch of runs.
 
-        `plant` has the environment's arguments from which the prior knowledge follows.
+        Parameters
+        ----------
+        plant
+            The environment's arguments, from which the controller's prior knowledge follows.
+        runs
+            Number of runs in the batch.
+        seed
+            Seed of the controller's random numbers: run i uses the seed `seed + i`.
         """
         parameters = Parameters(**{**plant, **self.observation})
         arguments = knowledge(self.prior_knowledge, parameters, runs, seed)
@@ -202,10 +239,11 @@ class ControllerSpec:
         return self.build(**arguments)
 
     def robust_time_constant(self, plant: Mapping[str, Any]) -> float:
-        """Return the value of the argument `tuned_by` with which Ms is `sensitivity`, s.
+        """Return the time constant for the argument `tuned_by` of `build`, s.
 
-        `plant` has the environment's arguments. The time constant is rounded to four digits, so
-        that it is the same on all machines.
+        The result is the smallest time constant with which Ms, the maximum sensitivity of the
+        loop with the nominal plant, is at most `sensitivity`. `plant` has the environment's
+        arguments. The result is rounded to four digits, so that it is equal on all machines.
         """
         parameters = Parameters(**plant)
         arguments = knowledge(self.prior_knowledge, parameters, 1, 0)
@@ -220,9 +258,9 @@ class ControllerSpec:
         return float(f"{exact:.4g}")
 
     def loop(self, plant: Mapping[str, Any]) -> LinearLoop:
-        """Return the loop of a linear controller with the nominal plant.
+        """Return the loop of this linear controller with the nominal plant.
 
-        `plant` has the environment's arguments.
+        `plant` has the environment's arguments. The record must have `linear` true.
         """
         controller: Any = self.make(plant, 1, 0)
         return LinearLoop.of(controller, nominal(Parameters(**plant)))
@@ -230,8 +268,9 @@ class ControllerSpec:
     def misfit(self, plant: Parameters) -> str:
         """Return a sentence that says why the controller does not fit a plant; "" if it fits.
 
-        A controller fits if the plant is like the one that the controller was made for, in what
-        the controller assumes. The errors of one that does not fit say nothing about it.
+        A controller fits if `plant` agrees with the plant `made_for` in all that the controller
+        `assumes`. If a controller does not fit the plant, the error does not show how good the
+        controller is.
         """
         made_for = Parameters(**self.made_for)
         direction = plant_scale.direction(plant)
@@ -256,20 +295,22 @@ class ControllerSpec:
         seed: int,
         controller: Agent | None = None,
     ) -> Trajectory:
-        """Run a controller on a batch of plants.
+        """Run the controller on a batch of plants, and return the signals of the runs.
 
         Parameters
         ----------
         plant
             The environment's arguments.
         samples
-            Length of the runs.
+            Length of a run, in samples.
         runs
-            Number of runs.
+            Number of runs in the batch.
         seed
-            Run i has the noise and the set point of the seed `seed + i`.
+            Seed of the first run: the environment draws the random numbers of run i, such as
+            its noise, with the seed `seed + i`.
         controller
-            The controller of a batch of `runs`; by default, it is made for this plant.
+            A controller that `make` or `in_service` has returned for a batch of `runs` runs; by
+            default, a new one is made for `plant`.
         """
         agent = controller or self.make(plant, runs, seed)
         arguments = {**plant, **self.observation}
@@ -279,9 +320,19 @@ class ControllerSpec:
         return rollout(make_plants(runs, samples, **arguments), agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller that is made for a plant, and has learnt on it if it learns.
+        """Return a controller for a batch of runs, after it has learnt if it can learn.
 
-        `plant` has the environment's arguments. The controller is one of a batch of `runs`.
+        A controller that learns runs `LEARNING` samples of the square wave on the plant before
+        it is returned.
+
+        Parameters
+        ----------
+        plant
+            The environment's arguments.
+        runs
+            Number of runs in the batch.
+        seed
+            Seed of the controller's random numbers: run i uses the seed `seed + i`.
         """
         controller = self.make(plant, runs, seed)
         if self.learns:

@@ -1,9 +1,10 @@
 """Declare and run the commands `python -m benchmarks.NAME`, and run their tasks in parallel.
 
-A command is a file `benchmarks/NAME.py`, or a folder `benchmarks/NAME` with a `__main__.py`. It
-has a dataclass of options, whose docstrings are the help, and a function `work`. The function
-takes the options, writes the results and returns the last line to print. The function also
-imports the packages that are slow to import, so that `--help` is quick.
+The code of the command NAME is the file `benchmarks/NAME.py`, or a folder `benchmarks/NAME`
+with a `__main__.py`. The code of a command defines a dataclass `Options`, whose docstrings are
+the text of `--help`, and a function `work`. The function `work` takes an instance of `Options`,
+writes the results and returns the last line to print. Packages that are slow to import are
+imported within `work`, so that `--help` is quick. The line
 `main = command("NAME", Options, work)` makes the command.
 """
 
@@ -28,7 +29,7 @@ from benchmarks.lib.errors import UnfinishedError, UsageError
 from benchmarks.lib.provenance import COMMAND_LINE, ROOT
 from benchmarks.lib.results import KeptResults
 
-# The extra of this project that installs a package.
+# The extra of this project, as in `pip install -e ".[EXTRA]"`, that installs each package.
 EXTRAS = {
     **dict.fromkeys(("cyclopts", "filelock", "joblib", "matplotlib", "pandas"), "compare"),
     **dict.fromkeys(("rich", "scipy", "tabulate"), "compare"),
@@ -37,14 +38,21 @@ EXTRAS = {
     "ray": "ray",
     "torch": "torch",
 }
+# System errors after which nothing more can be written: the disk is full, the quota or the
+# largest size of a file is exceeded, or the reader of a pipe has ended.
 NOTHING_WRITABLE = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EPIPE
 
 
 def stop(error: BaseException, program: str = "python -m benchmarks") -> NoReturn:
-    """Print an error as a sentence and end the program with status 2.
+    """Print the message of an error, without a traceback, and end this process with status 2.
 
-    If a package is missing, the sentence names the extra that installs it. An `ImportError` for
-    another reason is raised again, since it is a bug.
+    Parameters
+    ----------
+    error
+        The error. For an `ImportError` of a missing package in `EXTRAS`, the message names the
+        extra that installs the package. Any other `ImportError` is a bug, and is raised again.
+    program
+        The command, such as "python -m benchmarks.compare", which begins the message.
     """
     message = str(error)
     cause = error.__cause__ or error
@@ -65,14 +73,19 @@ try:
 except ImportError as _missing:
     stop(_missing)
 
-Group = TypeVar("Group")
+Group = TypeVar("Group")  # a dataclass whose fields are options of a command
 
-# Decorates a dataclass whose fields are options, also when it is nested in another dataclass.
+# A decorator of dataclasses: the fields become options of a command, `--field VALUE`, also if
+# the dataclass is the type of a field of another dataclass.
 options: Callable[[type[Group]], type[Group]] = Parameter(name="*")
 
 
 def _whole_number(_type: object, tokens: Sequence[Any]) -> int:
-    """Return the whole number that a user typed; cyclopts alone would round 2.5 to 2."""
+    """Convert the text that a user typed to an integer, for cyclopts.
+
+    The text is `tokens[0].value`. A ValueError is raised if the text is not a whole number;
+    cyclopts without this converter would turn 2.5 into 2.
+    """
     typed = tokens[0].value
     try:
         return int(typed)
@@ -81,18 +94,23 @@ def _whole_number(_type: object, tokens: Sequence[Any]) -> int:
 
 
 def _folder(_type: object, tokens: Sequence[Any]) -> Path:
-    """Return the folder that a user typed; cyclopts alone would take "" for this folder."""
+    """Convert the text that a user typed to the path of a folder, for cyclopts.
+
+    The text is `tokens[0].value`. A ValueError is raised if the text is empty; cyclopts without
+    this converter would turn "" into the current folder.
+    """
     if not tokens[0].value:
         raise ValueError("must name a folder")
     return Path(tokens[0].value)
 
 
 def _integers(least: int, most: int) -> Parameter:
-    """Return what makes an option accept the integers from `least` to `most` alone."""
+    """Return an annotation of an option that accepts integers from `least` to `most` only."""
     allowed = Number(gte=least, lte=most)
     return Parameter(converter=_whole_number, n_tokens=1, validator=allowed)
 
 
+# Types of options, with limits that no useful value exceeds.
 Count = Annotated[int, _integers(1, 1_000_000_000)]
 Runs = Annotated[int, _integers(1, 100_000)]
 Seed = Annotated[int, _integers(0, 2**63)]
@@ -105,7 +123,10 @@ Folder = Annotated[
 
 @contextmanager
 def blame(option: str) -> Iterator[None]:
-    """Turn a ValueError into a `UsageError` that names the option."""
+    """Turn a ValueError in the block of a `with` statement into a `UsageError`.
+
+    The message begins with `option`, the name of an option such as "--agent".
+    """
     try:
         yield
     except ValueError as error:
@@ -113,9 +134,21 @@ def blame(option: str) -> Iterator[None]:
 
 
 def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[str]:
-    """Return the names that an option lists, without repetitions.
+    """Return the names that a user has listed in an option, each once and in the same order.
 
-    A `UsageError` names the option if a listed name is not among `names`.
+    Parameters
+    ----------
+    option
+        The name of the option, such as "--scenarios", for the error message.
+    listed
+        The names that the user has listed.
+    names
+        All valid names.
+
+    Raises
+    ------
+    UsageError
+        If a listed name is not valid.
     """
     for name in listed:
         if name not in names:
@@ -124,7 +157,10 @@ def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[st
 
 
 def _default_as_typed(default: object) -> str | None:
-    """Return a default as a user would type it; None hides it in the help."""
+    """Return the default of an option as a user would type it, for the text of `--help`.
+
+    The result is None if the help is not to show a default: for None, False and ().
+    """
     if default is None or default is False or default == ():
         return None
     if isinstance(default, tuple):
@@ -133,10 +169,26 @@ def _default_as_typed(default: object) -> str | None:
 
 
 def read(declared: type[Group], program: str, words: Sequence[str]) -> Group | None:
-    """Read the words of a command line into options.
+    """Convert the words of a command line to options, or print the help after `--help`.
 
-    With `--help`, the help is printed and None is returned. An invalid option raises a
-    `UsageError`.
+    Parameters
+    ----------
+    declared
+        The dataclass of options.
+    program
+        The command, such as "python -m benchmarks.compare", for the help.
+    words
+        The words of the command line after the command.
+
+    Returns
+    -------
+    object or None
+        An instance of `declared`; None if the help was printed.
+
+    Raises
+    ------
+    UsageError
+        If an option is unknown or has an invalid value.
     """
     app = App(
         name=program,
@@ -161,8 +213,18 @@ def command(
 ) -> Callable[..., int]:
     """Return the function `main` of the command `python -m benchmarks.NAME`.
 
-    `main` takes the words of the command line after the program's name, by default those of
-    this process, and returns the exit status of `finish`.
+    `main(arguments)` takes the words of a command line after the command, by default the words
+    with which this process was started. The function `main` reads the options, calls `work`,
+    and returns the exit status of the command, as `finish` does.
+
+    Parameters
+    ----------
+    name
+        NAME, such as "compare".
+    declared
+        The dataclass of options.
+    work
+        Does the work for an instance of `declared`, and returns the last line to print.
     """
     program = f"python -m benchmarks.{name}"
 
@@ -185,11 +247,12 @@ def command(
 
 
 def finish(work: Callable[[], str], program: str) -> int:
-    """Do work, print the line that it returns, and return the exit status.
+    """Call `work`, print the line that it returns, and return the exit status of a command.
 
     The status is 0 for success; 1 if tasks failed, memory ran out, or nothing more could be
-    written; 130 after Ctrl-C and 143 after SIGTERM. An invalid option or a missing package ends
-    the program with status 2.
+    written; 130 after Ctrl-C and 143 after SIGTERM. After a `UsageError`, or if a package is
+    missing, this process ends with status 2. `program` is the command, such as
+    "python -m benchmarks.compare", which begins the error messages.
     """
     try:
         closing_line = work()
@@ -218,8 +281,9 @@ def finish(work: Callable[[], str], program: str) -> int:
 def _interrupt_on_signals() -> None:
     """Make the first Ctrl-C or SIGTERM raise a KeyboardInterrupt in this process.
 
-    Later signals are ignored, while the command writes what has finished. A signal that the
-    shell made this process ignore stays ignored.
+    The number of the signal is the argument of the KeyboardInterrupt. After the first signal,
+    Ctrl-C and SIGTERM are ignored, so that the command can write its finished results. A signal
+    that this process ignored when it was started, as with `nohup`, stays ignored.
     """
     signals = [
         number
@@ -236,24 +300,24 @@ def _interrupt_on_signals() -> None:
         signal.signal(number, interrupt)
 
 
-Task = Callable[[], Any]
+Task = Callable[[], Any]  # a part of a command's work that can run in another process
 
 
 class Answer(NamedTuple):
-    """The outcome of a task: its result, or its error as text, "" if it succeeded."""
+    """The outcome of a task that has ended."""
 
-    task: str
-    result: Any
-    error: str
+    task: str  # the name of the task
+    result: Any  # what the task returned; None if the task failed
+    error: str  # the message or traceback of a task that failed; "" after success
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class FanOut:
-    """Where joblib runs tasks, and how many run at once. A single job runs in this process.
+    """The options that say how many tasks run at once, and where joblib runs the tasks.
 
-    The result of a task does not depend on these options, as long as all randomness of the task
-    comes from its arguments.
+    With `--jobs 1`, tasks run in this process. The result of a task does not depend on these
+    two options if all random numbers of the task come from seeds in its arguments.
     """
 
     jobs: Count | None = None
@@ -264,24 +328,26 @@ class FanOut:
     def stream(
         self, tasks: Mapping[str, Task], title: str = "", store: KeptResults | None = None
     ) -> Iterator[tuple[str, Any]]:
-        """Run tasks, and yield the name and the result of a task as soon as it has finished.
+        """Run tasks, and yield the name and the result of each task that has succeeded.
+
+        A result is yielded as soon as the task has finished, in any order. On a Ray cluster,
+        all results are yielded at the end.
 
         Parameters
         ----------
         tasks
-            Functions without arguments by name, such as a `functools.partial` of a function of
-            a module. On a Ray cluster, all results come at the end.
+            The tasks by name: functions without arguments that can be pickled, such as a
+            `functools.partial` of a function of a module.
         title
             Title of the progress bar; "" for no progress bar.
         store
-            Results of an earlier run of the same tasks, which are yielded first. New results
-            are added to the store.
+            Stored results. A task whose result is stored is not run: its result is yielded
+            before all others. The results of tasks that run are added to the store.
 
         Raises
         ------
         UnfinishedError
-            If tasks failed, after all other tasks have finished. The message names the failed
-            tasks and their errors.
+            At the end, if tasks failed. The message names the failed tasks and their errors.
         """
         missing: dict[str, Task] = {}
         errors: dict[str, str] = {}
@@ -305,7 +371,11 @@ class FanOut:
             raise UnfinishedError(_summary(errors, len(tasks)))
 
     def _answers(self, tasks: Mapping[str, Task]) -> Iterator[Answer]:
-        """Run tasks, and yield their answers in the order in which they come."""
+        """Run tasks, and yield the outcome of a task when the task has ended, in any order.
+
+        `tasks` are as in `stream`. An `UnfinishedError` is raised if the system killed a
+        process that ran tasks; failed tasks raise nothing.
+        """
         import joblib  # imported here, as it is slow to import
 
         calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
@@ -334,7 +404,11 @@ class FanOut:
 
 @contextmanager
 def _ctrl_c_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C in this process; Python allows that in its main thread alone."""
+    """Ignore Ctrl-C in this process during the block of a `with` statement.
+
+    In a thread other than the main thread, nothing is done, since Python lets no other thread
+    change how signals are handled.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -346,7 +420,11 @@ def _ctrl_c_ignored() -> Iterator[None]:
 
 
 def _attempt(name: str, task: Task) -> Answer:
-    """Run a task, and return its error as text, since not every exception can be pickled."""
+    """Run the task called `name` in a worker process, and return the outcome of the task.
+
+    If the task raises an error, the outcome has the error as text, since not every exception
+    can be pickled.
+    """
     try:
         return Answer(name, task(), "")
     except UsageError as error:  # The message is for the user, who needs no traceback.
@@ -356,9 +434,17 @@ def _attempt(name: str, task: Task) -> Answer:
 
 
 def _summary(errors: Mapping[str, str], tasks: int) -> str:
-    """Return a text about the errors of some of the tasks, with the first one as a whole.
+    """Return the message of the `UnfinishedError` for failed tasks.
 
-    `errors` are texts by the name of the task. The last line of a text names the error.
+    The message has the last line of the error of each failed task, of at most 20 tasks, and
+    then all lines of the first error.
+
+    Parameters
+    ----------
+    errors
+        The message or traceback of each failed task, by the name of the task.
+    tasks
+        The number of all tasks, with those that succeeded.
     """
     lines = [f"{len(errors)} of {tasks} tasks failed; the other tasks have finished"]
     for name, text in list(errors.items())[:20]:
@@ -368,9 +454,11 @@ def _summary(errors: Mapping[str, str], tasks: int) -> str:
 
 
 def _prepare_worker(parent: int) -> None:
-    """Make this worker process ignore Ctrl-C, and end when the process `parent` has ended.
+    """Make this worker process ignore Ctrl-C, and end when its parent process has ended.
 
-    On Ctrl-C, which a terminal sends to all processes, the parent ends its workers.
+    joblib calls this function at the start of each worker process. `parent` is the process
+    identifier of the parent. A terminal sends Ctrl-C to the parent and to all workers; the
+    parent then ends the workers.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -384,9 +472,11 @@ def _prepare_worker(parent: int) -> None:
 
 @contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show a progress bar on a terminal, and yield a function that adds a finished task.
+    """Show a progress bar during the block of a `with` statement.
 
-    Nothing is shown if `title` is "". `total` is the number of tasks.
+    The block calls the yielded function, without arguments, each time a task has finished.
+    `total` is the number of tasks. The bar is hidden if `title` is "" or if the standard error
+    stream is not a terminal.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -398,9 +488,11 @@ def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 def _connect_to_ray() -> None:
-    """Connect to the Ray cluster at RAY_ADDRESS, by default the one on this machine.
+    """Connect this process to a Ray cluster, and make "ray" a backend of joblib.
 
-    Ray copies the checkout to its nodes. A `UsageError` is raised if no cluster can be reached.
+    The environment variable RAY_ADDRESS has the address of the cluster; by default, a cluster
+    on this machine is looked for. Ray copies the code of the checkout to the nodes of the
+    cluster. A `UsageError` is raised if no cluster can be reached.
     """
     import ray  # imported here, as it is optional and slow to import
     from ray.util.joblib import register_ray

@@ -1,8 +1,8 @@
 """Make the pictures of reports in one style.
 
-A picture is 975 pixels wide, readable when a page shows it at 750, and stands on a white
-background with a margin, so that it can also be read on a dark page. Its title is a sentence
-that says what the picture shows.
+A picture is 975 pixels wide, and its text is still readable when a page shows the picture 750
+pixels wide. A picture has a white background with a margin, so that it is also readable on a
+dark page. The title of a picture is a sentence that says what the picture shows.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = "#0072B2", "#D55E00"  # of lines that stand for no controller
-WIDTH = 7.5  # of a picture, inches
-TITLE_CHARACTERS = 90  # on a line of a title
-PALETTE = 128  # colours of a saved picture; fewer make the file smaller
+COLOURS = "#0072B2", "#D55E00"  # of lines that do not belong to a controller
+WIDTH = 7.5  # of a picture, inches: 975 pixels at 130 dots per inch
+TITLE_CHARACTERS = 90  # per line of a title: as many as fit in the width of a picture
+PALETTE = 128  # number of colours in a PNG file; fewer colours make the file smaller
+# matplotlib's `rcParams` for all pictures.
 STYLE: Any = {
     "axes.grid": True,
     "axes.titlelocation": "left",
@@ -39,36 +40,42 @@ STYLE: Any = {
     "font.size": 9,
     "grid.alpha": 0.3,
     "legend.frameon": False,
-    "text.parse_math": False,  # a user's name of a controller may contain a dollar sign
+    "text.parse_math": False,  # The name of a user's controller may contain a dollar sign.
 }
 
-# How a set point, an actuator's dead zone and its limits are drawn over time.
+# Arguments of matplotlib's functions that draw the set point, the dead zone of the actuator,
+# and the limits of the actuator over time.
 SETPOINT: Any = {"color": "black", "linestyle": "--", "linewidth": 0.8}
 DEAD_ZONE: Any = {"color": "0.5", "alpha": 0.2, "linewidth": 0}
 LIMIT: Any = {"color": "0.4", "linestyle": ":", "linewidth": 1.0}
 
 RATIO_LABEL = "error / least possible error\n(axis logarithmic in the ratio minus 1)"
-RATIO_FLOOR = 1.001  # Smaller ratios cannot be shown on a logarithmic axis: they stand here.
+# The smallest error ratio that is drawn; smaller ratios are drawn at this ratio. An error ratio
+# of 1 would lie at minus infinity on an axis that is logarithmic in the ratio minus 1.
+RATIO_FLOOR = 1.001
+# Error ratios with a label on the axis of error ratios, about equally far apart.
 RATIO_TICKS = 1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0, 4.0, 11.0, 31.0
 
 
 def percent(share: float) -> str:
-    """Return a share as text in whole percent, such as "5 %"."""
+    """Return a share from 0 to 1 as text in whole percent, such as "5 %" for 0.05."""
     return f"{100.0 * share:.0f} %"
 
 
 @contextmanager
 def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
-    """Yield an empty figure, and save it as a PNG file when the block ends without an error.
+    """Yield an empty figure with a title, to be drawn on in the block of a `with` statement.
+
+    The figure is saved as a PNG file when the block ends without an error.
 
     Parameters
     ----------
     path : Path
-        The file.
+        The PNG file.
     height : float
         Height of the picture, inches. The width is `WIDTH`.
     title : str
-        A sentence, which is broken into lines.
+        A sentence above the picture, broken into lines of at most `TITLE_CHARACTERS`.
     """
     from matplotlib import rc_context  # imported here, as it is slow
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -88,16 +95,16 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
 
 @dataclass(frozen=True)
 class Panels:
-    """A figure with a panel for each of several names, in rows.
+    """A figure with a grid of panels, such as one panel for each controller.
 
     Attributes
     ----------
     figure : Figure
         The figure.
     axes : sequence of Axes
-        The panels, one for each name.
+        The panels, row by row.
     unused : sequence of Axes
-        The empty places at the end of the last row.
+        The invisible axes that fill the last row of the grid behind the last panel.
     columns : int
         Number of panels in a full row.
     """
@@ -108,16 +115,22 @@ class Panels:
     columns: int
 
     def label_edges(self, x: str, y: str) -> None:
-        """Name the axes: `y` at the left of each row, `x` below each column."""
+        """Write the label `y` at the left of each row, and the label `x` below each column."""
         for panel in self.axes[:: self.columns]:
             panel.set_ylabel(y)
         for panel in self.axes[-self.columns :]:
             panel.set_xlabel(x)
 
     def add_legend(self, entries: Mapping[str, Artist], columns: int) -> None:
-        """Put a legend in the unused places of the last row, or else below all panels.
+        """Add a legend in the unused part of the last row of panels, or below all panels.
 
-        `entries` has an artist for each text. A legend below the panels has `columns` columns.
+        Parameters
+        ----------
+        entries
+            The line or patch that the legend shows beside each text, by the text.
+        columns
+            Number of columns of a legend below all panels. A legend in the last row has one
+            column.
         """
         handles = list(entries.values())
         texts = list(entries)
@@ -132,20 +145,22 @@ class Panels:
 def open_panels(
     path: Path, names: Sequence[str], height: float, columns: int, title: str
 ) -> Iterator[Panels]:
-    """Yield a figure with a panel for each name, and save it as `open_picture` does.
+    """Yield a figure with a grid of panels, to be drawn on in the block of a `with` statement.
+
+    The figure is saved as a PNG file when the block ends without an error.
 
     Parameters
     ----------
     path : Path
         The PNG file.
     names : sequence of str
-        Headings of the panels.
+        The heading of each panel.
     height : float
         Height of a panel, inches.
     columns : int
-        Number of panels in a full row.
+        Largest number of panels in a row.
     title : str
-        A sentence.
+        A sentence above the figure.
     """
     columns = min(columns, len(names))
     rows = math.ceil(len(names) / columns)
@@ -161,15 +176,25 @@ def open_panels(
 
 
 def excess(ratios: ArrayLike) -> NDArray[np.float64]:
-    """Return `ratio - 1`, at least that of `RATIO_FLOOR`, to be drawn on a logarithmic axis."""
+    """Return error ratios minus 1, an array of the shape of `ratios`, for a logarithmic axis.
+
+    Ratios below `RATIO_FLOOR` are first replaced by `RATIO_FLOOR`, so all results are positive.
+    """
     return np.maximum(ratios, RATIO_FLOOR) - 1.0
 
 
 def scale_by_ratio(axes: Axes, direction: Literal["x", "y"], ratios: ArrayLike) -> None:
-    """Make an axis of `excess(ratios)` logarithmic, with ratios as the labels of its ticks.
+    """Make the axis on which `excess(ratios)` is drawn logarithmic, with labels for ratios.
 
-    The axis is as long as the ratios need. If one of them is below `RATIO_FLOOR`, the label
-    of the lowest tick says that marks at this tick stand for smaller ratios, too.
+    Parameters
+    ----------
+    axes
+        The panel.
+    direction
+        The axis of the panel, "x" or "y".
+    ratios
+        All error ratios in the panel, which set the ends of the axis. If one of the ratios is
+        below `RATIO_FLOOR`, the label of the lowest tick is "< 1.001" in place of "1.001".
     """
     from matplotlib import ticker
 

@@ -13,15 +13,22 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]  # the checkout
 CODE_FOLDERS = "mptc_gym", "agents", "benchmarks"
-CODE_SUFFIXES = {".py", ".npz", ".json"}  # with trained networks and the bounds of the package
+# Source files, trained networks (.npz) and the error bounds of the package (.json).
+CODE_SUFFIXES = {".py", ".npz", ".json"}
+# Packages other than Python itself whose versions may change a result.
 PACKAGES = "gymnasium", "numpy", "optuna", "scipy", "stable_baselines3", "torch"
 
-# The command line of the command that runs, as a user can type it; "" if no command runs.
+# The command line that this process executes, such as "python -m benchmarks.compare"; "" if a
+# function was called from Python.
 COMMAND_LINE: ContextVar[str] = ContextVar("COMMAND_LINE", default="")
 
 
 def origin() -> dict[str, Any]:
-    """Return the provenance of results that are computed now, JSON-serialisable."""
+    """Return the provenance of results that are computed now, as a dict that JSON can store.
+
+    The keys are "started" (the present time, UTC, ISO 8601), "command" (the command line),
+    "versions" (of packages), "commit" (of git) and "code" (a hash of the source files).
+    """
     return {
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "command": COMMAND_LINE.get(),
@@ -32,7 +39,7 @@ def origin() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that affect a result."""
+    """Return the versions of Python, mptc_gym and the installed `PACKAGES`, by name."""
     import mptc_gym  # imported here, as Gymnasium is slow to import
 
     installed = {"python": platform.python_version(), "mptc_gym": mptc_gym.__version__}
@@ -44,9 +51,10 @@ def versions() -> dict[str, str]:
 
 @cache
 def commit() -> str:
-    """Return the commit of the checkout, with "-dirty" after it if files differ from it.
+    """Return the hash of the checked-out git commit, 40 digits.
 
-    The result is "" without git, and if the checkout is not a repository.
+    If files of the checkout differ from the commit, "-dirty" follows the hash. If git is not
+    installed or the checkout is not a git repository, the result is "".
     """
     if not (ROOT / ".git").exists():  # git would look for a repository around it.
         return ""
@@ -63,7 +71,10 @@ def commit() -> str:
 
 @cache
 def code_hash() -> str:
-    """Return a SHA-256 hash of the checkout's source files, trained networks and bounds."""
+    """Return a SHA-256 hash of the files in `CODE_FOLDERS` with a suffix in `CODE_SUFFIXES`.
+
+    Files in folders called "published", which have results and no code, do not count.
+    """
     digest = hashlib.sha256()
     for folder in CODE_FOLDERS:
         for path in sorted((ROOT / folder).rglob("*")):

@@ -1,4 +1,4 @@
-"""Write a report in Markdown with its pictures, and print its tables."""
+"""Write the report of a command as a Markdown file, and print the tables of the report."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ from benchmarks.lib.storage import write_text
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a report. Its texts are shown as they are, not read as Markdown.
+    """A section of a report.
+
+    The texts of a section are plain text: characters such as `*` are shown as they are.
 
     Attributes
     ----------
     title : str
-        The heading; "" for none.
+        The heading of the section; "" for a section without a heading.
     text : sequence of str
-        Paragraphs.
+        The paragraphs of the section, above the table.
     table : pandas.DataFrame, optional
-        A table of texts.
+        A table whose cells are texts.
     bold : collection of str
-        Cells of the table that are shown in bold type.
+        Texts: a cell of the table that is equal to one of these texts is shown in bold type.
     pictures : mapping
-        The captions of PNG files, by their names in the report's folder.
+        The caption of each picture, by the name of its PNG file in the folder of the report.
     """
 
     title: str
@@ -46,21 +48,23 @@ def write_report(
     origin: Mapping[str, Any],
     printed: int | None = None,
 ) -> None:
-    """Write `report.md`, and print its first sections.
+    """Write a report to the file `report.md` in a folder, and print its first sections.
 
     Parameters
     ----------
     folder
-        The folder of the report and its pictures. A picture that is missing is left out.
+        The folder to write to, which already has the PNG files of the sections. If the file of
+        a picture is missing, the report leaves the picture out.
     title
-        The heading of the report.
+        The heading of the report, as plain text.
     sections
-        The parts of the report.
+        The sections of the report, in order.
     origin
-        The provenance of the results, as `provenance.origin` returns it. If it has the key
-        "missing", the first line of the report says that these results are missing.
+        The provenance of the results, as `provenance.origin` returns it. If some results are
+        missing, the key "missing" has a text that says which results are missing, and the
+        report begins with this text.
     printed
-        Number of sections to print; None prints all.
+        The number of sections to print on the terminal; None prints all sections.
     """
     unfinished = f"Unfinished: {origin['missing']}." if "missing" in origin else ""
     page = [f"# {escape(title)}"]
@@ -76,7 +80,10 @@ def write_report(
 
 
 def _in_markdown(section: Section, folder: Path) -> list[str]:
-    """Return the blocks of a section in Markdown, with the pictures that are in the folder."""
+    """Return a section as blocks of Markdown, such as a heading, a paragraph or a table.
+
+    Of the pictures of the section, those are included whose PNG files are in `folder`.
+    """
 
     def cell(text: object) -> str:
         escaped = escape(text)
@@ -96,10 +103,10 @@ def _in_markdown(section: Section, folder: Path) -> list[str]:
 
 
 def escape(text: object) -> str:
-    """Return Markdown, on one line, that shows a text as it is.
+    """Return one line of Markdown that a reader sees as the plain text `str(text)`.
 
-    The name of a controller, a file or a column comes from outside. Without this function it
-    could end a cell of a table, or bring HTML and links into the page.
+    Names of controllers, files and columns come from the user. Without this function, such a
+    name could end a cell of a table, or bring HTML and links into the page.
     """
     escaped = " ".join(str(text).split()).replace("\\", "\\\\")
     escaped = escaped.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
@@ -111,7 +118,10 @@ def escape(text: object) -> str:
 
 
 def _source(origin: Mapping[str, Any]) -> str:
-    """Return when, with which code and by which command results were made, in a line."""
+    """Return the last line of a report: the time, the version of the code, and the command.
+
+    `origin` is the provenance of the results, as `provenance.origin` returns it.
+    """
     commit = origin["commit"]  # a hash of 40 digits, "-dirty" after it or not; or ""
     version = f"commit {commit[:12]}{commit[40:]}" if commit else f"code {origin['code'][:12]}"
     command = origin["command"] or "called from Python"
@@ -119,7 +129,7 @@ def _source(origin: Mapping[str, Any]) -> str:
 
 
 def _print(section: Section) -> None:
-    """Print a section without its pictures."""
+    """Print the heading, the paragraphs and the table of a section on the terminal."""
     width = shutil.get_terminal_size((150, 24)).columns
     for text in (section.title, *section.text):
         if text:
@@ -129,10 +139,10 @@ def _print(section: Section) -> None:
 
 
 def on_screen(table: pd.DataFrame) -> str:
-    """Return a table of texts as lines that are no wider than the terminal.
+    """Return a table as text whose lines are no wider than the terminal.
 
-    If the columns do not fit on a line, the table is broken into blocks below each other, which
-    all begin with the first column.
+    If the columns of the table need more than the width of the terminal, the text consists of
+    several tables, one below the other, each with the first column and some other columns.
     """
     width = shutil.get_terminal_size((150, 24)).columns
     first = table.columns[0]

@@ -1,7 +1,8 @@
-"""Keep the results of a run in a folder, and the results of an unfinished run beside it.
+"""Keep the results of a command in a folder, also if the command is interrupted.
 
-A run writes to the folder `NAME.unfinished`. When the run has finished, this folder takes the
-place of the folder `NAME`, so that no file of an earlier run stays beside a new report.
+A command that is to write to the folder `NAME` first writes to the folder `NAME.unfinished`. At
+the end of the command, `NAME.unfinished` replaces `NAME`, so that no file of an earlier run of
+the command stays beside a new report. In this module, a run is one execution of a command.
 """
 
 import hashlib
@@ -22,35 +23,37 @@ from benchmarks.lib.errors import UnfinishedError, UsageError
 from benchmarks.lib.provenance import COMMAND_LINE, code_hash, versions
 from benchmarks.lib.storage import out_folder, write_json
 
-RECORD = "run.json"  # in a folder of results: what the run depends on, and the files it wrote
-TASKS = "tasks"  # in the folder of an unfinished run: the results of finished tasks
+RECORD = "run.json"  # file in a folder of results: conditions, and names of the written files
+TASKS = "tasks"  # folder in the folder of an unfinished run: the results of finished tasks
 HARMLESS = {".DS_Store", "Thumbs.db"}  # files that file managers add to a folder
-IRRELEVANT = {"out", "fan_out"}  # options on which no result depends
+IRRELEVANT = {"out", "fan_out"}  # fields of `Options` on which no result depends
 
 
 @contextmanager
 def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) -> Iterator[Path]:
-    """Yield a folder to write to, which takes the place of `target` at the end of the block.
+    """Yield a folder to write to, which replaces the folder `target` at the end of the block.
 
-    If the block raises an error or is interrupted, the yielded folder stays beside `target`,
-    under the name of `target` with `.unfinished` after it, and `target` stays as it was.
+    The yielded folder lies beside `target` and has the name of `target` with `.unfinished`
+    after it. If the block of the `with` statement raises an error or is interrupted, the
+    yielded folder is kept with the files in it, and `target` stays as it was.
 
     Parameters
     ----------
     target
-        The folder of `--out`. A run replaces the files of an earlier run and no other files.
+        The folder that the user has chosen by `--out`. If `target` has files that no earlier
+        run wrote, a `UsageError` is raised, and nothing is removed.
     conditions
-        All that the results depend on, as `conditions_of` returns it. If the folder of an
-        unfinished run has the same conditions, the run goes on in that folder. None: the run
-        always starts in an empty folder.
+        All that the results depend on, as `conditions_of` returns it. If an unfinished run with
+        equal conditions has left its folder, this folder is yielded, with the files in it.
+        Otherwise, and if `conditions` is None, the yielded folder is empty.
 
     Raises
     ------
     UsageError
-        If the folder cannot be written to, if another run is writing to it, or if it holds
-        files that no run wrote.
+        If `target` cannot be written to, if another process is writing to `target`, or if
+        `target` or the yielded folder has files that no run wrote.
     UnfinishedError
-        If the results cannot be moved to `target`.
+        If the yielded folder cannot be renamed to `target` at the end.
     """
     place = target.resolve()
     if not place.name:
@@ -74,10 +77,15 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
 
 
 def _lock(place: Path) -> AbstractContextManager[object]:
-    """Lock a folder of results until the end of a `with` block.
+    """Return a lock on a folder of results, which the end of a `with` block releases.
 
-    The system frees the lock if this process is killed. A `UsageError` is raised if another run
-    holds the lock.
+    The folder `place` need not exist: the lock is a hidden file beside the folder. The
+    operating system releases the lock if this process is killed.
+
+    Raises
+    ------
+    UsageError
+        If another process has locked the folder.
     """
     from filelock import FileLock, Timeout  # imported here, as --help needs no lock
 
@@ -90,14 +98,21 @@ def _lock(place: Path) -> AbstractContextManager[object]:
 
 
 def _files(folder: Path) -> list[str]:
-    """Return the names of the files in a folder, sorted; none if the folder does not exist."""
+    """Return the sorted names of the files and folders in a folder, except `HARMLESS` ones.
+
+    If the folder does not exist, the list is empty.
+    """
     if not folder.exists():
         return []
     return sorted({path.name for path in folder.iterdir()} - HARMLESS)
 
 
 def _record(folder: Path) -> dict[str, Any]:
-    """Return the record of the run that wrote a folder; empty if there is no valid record."""
+    """Return the content of the file `RECORD` in a folder of results.
+
+    The keys are "command", "conditions" and, after a finished run, "files". If the file is
+    missing or is not JSON, the dict is empty.
+    """
     try:
         record: dict[str, Any] = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -106,7 +121,10 @@ def _record(folder: Path) -> dict[str, Any]:
 
 
 def _refuse_other_files(place: Path) -> None:
-    """Raise a `UsageError` if a folder of results holds files that its run did not write."""
+    """Raise a `UsageError` if the folder `place` has files that no finished run has recorded.
+
+    So a command never replaces a folder with files of the user.
+    """
     if place.exists() and not place.is_dir():
         raise UsageError(f"--out: {place} cannot be written to: it is not a folder")
     written = {RECORD, *_record(place).get("files", [])}
@@ -120,7 +138,12 @@ def _refuse_other_files(place: Path) -> None:
 
 
 def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
-    """Make an empty folder for a run, or go on in the folder of a run with these conditions."""
+    """Prepare the folder that `results_folder` yields.
+
+    If an unfinished run with equal `conditions` has left the folder `unfinished`, the folder
+    stays as it is. Otherwise, and if `conditions` is None, the folder becomes empty except for
+    the file `RECORD`. A `UsageError` is raised if the folder has files but no valid `RECORD`.
+    """
     record = _record(unfinished)
     is_in_use = bool(_files(unfinished))
     if is_in_use and not record:
@@ -136,7 +159,11 @@ def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
 
 
 def _keep_or_remove(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
-    """Tell where the results of an interrupted run are; remove its folder if it has none."""
+    """Print where the results of an interrupted run are, or remove the folder of the run.
+
+    The folder `unfinished` is removed if it has no results. If there are `conditions`, as
+    `results_folder` describes them, a second line says that the same command continues.
+    """
     if _files(unfinished) == [RECORD]:
         shutil.rmtree(unfinished)
         return
@@ -146,7 +173,10 @@ def _keep_or_remove(unfinished: Path, conditions: Mapping[str, Any] | None) -> N
 
 
 def _finish(unfinished: Path, place: Path) -> None:
-    """Record the files of a finished run, and move its folder to its place."""
+    """Write the names of a finished run's files to `RECORD`, and rename the run's folder.
+
+    The folder `unfinished` replaces the folder `place`.
+    """
     _refuse_other_files(place)  # Somebody may have added files since the run began.
     shutil.rmtree(unfinished / TASKS, ignore_errors=True)
     record = {**_record(unfinished), "files": _files(unfinished)}
@@ -160,10 +190,18 @@ def _finish(unfinished: Path, place: Path) -> None:
 
 
 def conditions_of(command: str, options: Any) -> dict[str, Any]:
-    """Return all that the results of a command depend on, JSON-serialisable.
+    """Return all that the results of a command depend on, as a dict that JSON can store.
 
-    Results depend on the options, on the code and on the versions of packages. `options` is the
-    dataclass of options. If an option is a file, its content counts, not its name.
+    Two runs of a command with equal conditions have equal results. The conditions are the name
+    of the command, its options, a hash of the code, and the versions of Python and of packages.
+
+    Parameters
+    ----------
+    command
+        The name of the command, such as "sweep".
+    options
+        The command's options, a dataclass. An option that is a file is replaced by a hash of
+        the content of the file. The options in `IRRELEVANT` are left out.
     """
     conditions = {
         "command": command,
@@ -176,7 +214,7 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
 
 
 def _relevant(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options on which results depend; options may be nested in groups."""
+    """Return options by name without those in `IRRELEVANT`, in all nested dicts, too."""
     relevant = {}
     for name, value in options.items():
         if isinstance(value, dict):
@@ -187,19 +225,26 @@ def _relevant(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _content(value: object) -> str:
-    """Return a hash of the content of a file, given its path, and another value as text."""
+    """Return an object that JSON cannot store as text, for `json.dumps`.
+
+    The text is a SHA-256 hash of the content if `value` is the path of a file, and otherwise
+    `str(value)`.
+    """
     if isinstance(value, Path) and value.is_file():
         return hashlib.sha256(value.read_bytes()).hexdigest()
     return str(value)
 
 
 def save_arrays(path: Path, result: Mapping[str, Any]) -> None:
-    """Save numbers and arrays by name as an NPZ file."""
+    """Save `result`, a mapping from names to numbers or arrays, as the NPZ file `path`."""
     np.savez(path, **result)
 
 
 def load_arrays(path: Path) -> dict[str, Any]:
-    """Return the numbers and arrays of an NPZ file by name, without running code in it."""
+    """Return the numbers and arrays of the NPZ file `path` by name, as saved by `save_arrays`.
+
+    Pickled objects are refused with a ValueError, since loading them could run foreign code.
+    """
     result = {}
     with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         for name, array in arrays.items():
@@ -210,18 +255,18 @@ def load_arrays(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class KeptResults:
-    """The results of the finished tasks of an unfinished run, in a file for each task.
+    """The results of finished tasks, one file each, with which an interrupted run can continue.
 
-    The files are removed when the run has finished.
+    `results_folder` removes the files when the whole run has finished.
 
     Attributes
     ----------
     folder : Path
-        The folder that `results_folder` yields.
+        The folder that `results_folder` yields. The files are in its folder `TASKS`.
     save_file : callable
-        Saves a result: `save_file(path, result)`.
+        Saves the result of a task to a file: `save_file(path, result)`.
     load_file : callable
-        Returns the result in a file: `load_file(path)`.
+        Returns the result of a task from a file: `load_file(path)`.
     """
 
     folder: Path
@@ -229,18 +274,21 @@ class KeptResults:
     load_file: Callable[[Path], Any] = load_arrays
 
     def path(self, name: str) -> Path:
-        """Return the file of the task with this name."""
+        """Return the path of the file for the result of the task called `name`."""
         return self.folder / TASKS / f"{quote(name, safe=' ,')}.npz"
 
     def load(self, name: str) -> Any:
-        """Return the result of a task; None if its file is missing or damaged."""
+        """Return the stored result of a task; None if its file is missing or damaged.
+
+        `name` is the name of the task.
+        """
         try:
             return self.load_file(self.path(name))
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None
 
     def save(self, name: str, result: Any) -> None:
-        """Write the result of a task to its file."""
+        """Write `result`, the result of the task called `name`, to the file of the task."""
         path = self.path(name)
         path.parent.mkdir(exist_ok=True)
         self.save_file(path, result)

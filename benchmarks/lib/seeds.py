@@ -1,8 +1,8 @@
-"""The table of seeds: each purpose has a block of seeds.
+"""Define the ranges of seeds that training, searches and published results use.
 
-An episode of the environment follows from its seed. Blocks do not overlap, so controllers are
-never measured in the episodes on which they were trained or chosen. Bootstraps and designs of
-plants draw no episode; the seeds of their generators start at 0.
+A seed of the environment determines all random numbers of an episode. The ranges do not
+overlap, so no controller is measured in episodes on which the controller was trained or chosen.
+Random generators that make no episodes, such as that of a bootstrap, have seeds from 0 on.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from mptc_gym import evaluation
 
 @dataclass(frozen=True)
 class Block:
-    """A number of consecutive seeds from `first` on, and their purpose."""
+    """A range of `count` consecutive seeds from the seed `first` on, and its purpose."""
 
     first: int
     count: int
@@ -20,7 +20,7 @@ class Block:
 
     @property
     def seeds(self) -> range:
-        """All seeds of the block."""
+        """All seeds of the block, in rising order."""
         return range(self.first, self.first + self.count)
 
 

@@ -10,22 +10,38 @@ from benchmarks.lib.errors import UsageError
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, in UTF-8 and with the line ends of Unix."""
+    """Write `text` to the file `path`, in UTF-8 and with the line ends of Unix."""
     path.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file; values that JSON does not know, such as paths, are written as text."""
+    """Write `value` to the JSON file `path`.
+
+    Objects of types that JSON does not have, such as paths, are written as `str(object)`.
+    """
     write_text(path, json.dumps(value, indent=2, default=str) + "\n")
 
 
 def write_csv(path: Path, table: Any) -> None:
-    """Write a table of pandas as a CSV file without its index."""
+    """Write `table`, a DataFrame of pandas, to the CSV file `path`, without the row index."""
     table.to_csv(path, index=False, lineterminator="\n")
 
 
 def out_folder(folder: Path, option: str = "--out") -> Path:
-    """Create and return a folder; a `UsageError` names the option if it is not writable."""
+    """Create a folder with its parent folders if it is missing, and return the folder.
+
+    Parameters
+    ----------
+    folder
+        The folder, which a user has chosen by an option of a command.
+    option
+        The option, such as "--out", which the error message names.
+
+    Raises
+    ------
+    UsageError
+        If the folder cannot be created, or if no file can be written to the folder.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -36,9 +52,9 @@ def out_folder(folder: Path, option: str = "--out") -> Path:
 
 
 def file_name(text: str) -> str:
-    """Return a text as part of the name of a file, so that it cannot name another folder.
+    """Return `text` in a form that is safe as part of a file name.
 
-    Characters other than letters, digits, `-` and `_` become `_`. The result has at most 100
-    characters.
+    Characters other than letters, digits, `-` and `_` become `_`, so the result contains no
+    path separator. The result has at most 100 characters.
     """
     return re.sub(r"[^\w-]", "_", text)[:100]

@@ -1,1 +1,1 @@
-"""Hold the cases, the loop of controller and plant, its measures, and linear models."""
+"""Define cases, run controllers on plants, measure the runs, and model plants as linear."""

@@ -1,10 +1,16 @@
 """Fit a plant with a dead zone, a delay and one or two lags to a log, with 95 % intervals.
 
-The model of the temperature is a sum of terms: the gain times the response to the flow behind
-the dead zone, and the background. The background is a constant, the decay of the plant's state
-at the first row, the responses to measured disturbances and the responses to steps of
-unmeasured loads. What remains is noise C(z) / D(z) xi with white xi. The fit minimises the sum
-of the squared prediction errors, which are estimates of xi (a Box-Jenkins model).
+A log is a table of flows and temperatures, with one row a sample. The model of the temperature
+has three parts:
+
+- the flow response: the gain times the response of the delay and the lags to the flow behind
+  the dead zone;
+- the background: a constant, the decay of the plant's state at the first row, the responses to
+  measured disturbances, and the responses to steps of unmeasured loads;
+- noise C(z^-1) / D(z^-1) xi, with the white noise xi and two polynomials C and D.
+
+The fit minimises the sum of the squared prediction errors, which are estimates of the white
+noise xi (a Box-Jenkins model).
 """
 
 from dataclasses import dataclass, replace
@@ -21,20 +27,24 @@ from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 
-# A part of the model must improve the fit by this much (see `Fit.improvement`), because any
-# part improves it a little by chance.
+# A second lag, a dead zone and a load step become part of the model only if they improve the
+# fit by these values of `Fit.improvement`, because any part improves a fit a little by chance.
 SECOND_LAG = 10.0
 DEAD_ZONE = 9.0
-LOAD_STEP = 25.0  # the largest, because the time of the step is chosen among hundreds
-MOST_LOAD_STEPS = 4
+LOAD_STEP = 25.0  # the largest, because the time of a step is chosen among hundreds of times
+MOST_LOAD_STEPS = 4  # in a model: with many steps, the model could fit any temperature
 # Standard errors are multiplied by this factor, because no plant is quite of the model's form.
-# With this factor, 95 % intervals held the gain in 19 of 20 logs of simulated plants or more.
+# With this factor, the 95 % intervals of the gain contained the true gain in at least 95 % of
+# the logs of simulated plants.
 SPREAD = 1.5
-GRID = 31  # values of the centre and of the half width of a dead zone that are tried
-DISTURBANCE_LAGS = 0.3, 0.9, 3.0  # multiples of the plant's larger time constant
-MOST_BLOCKS = 2000  # a fit to more means of rows takes longer and is not better
-# The noise filter starts from zero. Until it has settled, the prediction errors are as large as
-# the noise. They count little, but without them the state at the first row would be arbitrary.
+GRID = 31  # number of centres, and number of half widths, of a dead zone that are tried
+# Time constants of the lags of a measured disturbance, divided by the plant's larger time
+# constant.
+DISTURBANCE_LAGS = 0.3, 0.9, 3.0
+MOST_BLOCKS = 2000  # blocks of rows in a fit; a fit to more blocks takes longer, with no gain
+# The filter that whitens the noise starts from zero. Before this filter has settled, in the
+# first blocks, the prediction errors are as large as the noise, so their weight is small. With
+# the weight 0, the fit would not determine the state of the plant at the first row.
 SETTLING_BLOCKS = 10
 SETTLING_WEIGHT = 0.1
 TINY = 1e-30  # prevents divisions by zero
@@ -42,39 +52,45 @@ TINY = 1e-30  # prevents divisions by zero
 
 @dataclass(frozen=True)
 class Log:
-    """A recorded log with one row a sample and without missing numbers."""
+    """A log of a plant: a table with one row a sample, without missing values."""
 
-    flow: Array  # commanded from the time of the row on, t/h, (rows,)
-    temperature: Array  # at the time of the row, degC, (rows,)
-    disturbances: Array  # measured disturbances in any unit, (rows, disturbances)
-    sampling_interval: float  # s
+    flow: Array  # the flow commanded from the time of each row on, t/h, shape (rows,)
+    temperature: Array  # the temperature at the time of each row, degC, shape (rows,)
+    disturbances: Array  # measured disturbances, in any units, shape (rows, disturbances)
+    sampling_interval: float  # the time between two rows, s
 
 
 class DeadZone(NamedTuple):
-    """Flows nearer to the centre than the half width act on the plant as the centre does."""
+    """A dead zone of a valve: an interval of flows that all act like the flow in its middle."""
 
-    centre: float  # t/h
-    half_width: float = 0.0  # t/h
+    centre: float  # the middle of the interval, t/h
+    half_width: float = 0.0  # half of the interval's length, t/h; 0 for no dead zone
 
     def passed(self, flow: Array) -> Array:
-        """Return the flow behind the valve, (29), for the flow in front of it; both in t/h."""
+        """Return the flow that acts on the plant when `flow` is commanded, both in t/h.
+
+        A flow inside the dead zone becomes the centre, as in equation (29) of the paper. The
+        result has the shape of `flow`.
+        """
         is_inside = np.abs(flow - self.centre) < self.half_width
         return np.where(is_inside, self.centre, flow)
 
 
 def respond(flows: Array, delay: float, slow: float, fast: float = 0.0) -> Array:
-    """Return the response of a delay and one or two lags in series, with gain 1.
+    """Return the output of a delay and one or two lags in series, with gain 1, for some flows.
 
-    The response is exact for a flow that is held from row to row and was 0 before the first.
+    The result has the shape of `flows`. The result is exact for a flow that is constant from
+    one row to the next and was 0 before the first row.
 
     Parameters
     ----------
     flows : array of shape (rows, ...)
-        Flows.
+        The flows, or other inputs, in any unit.
     delay : float
-        Delay in samples, which need not be an integer.
+        The delay in samples, which need not be an integer.
     slow, fast : float
-        Time constants of the lags in samples; `fast` is below `slow`, and 0 for a single lag.
+        The time constants of the two lags in samples; `fast` is below `slow`, or 0 for a single
+        lag.
     """
     if fast > 0.0:  # partial fractions
         slow_part = slow * respond(flows, delay, slow)
@@ -92,20 +108,21 @@ def respond(flows: Array, delay: float, slow: float, fast: float = 0.0) -> Array
 
 
 def stable_polynomial(first: float, second: float) -> Array:
-    """Return 1 + p z^-1 + q z^-2 for two reflection coefficients.
+    """Return the coefficients (1, p, q) of a polynomial 1 + p z^-1 + q z^-2.
 
-    The roots are inside the unit circle if both coefficients are between -1 and 1.
+    `first` and `second` are the reflection coefficients of the polynomial. All roots z lie
+    inside the unit circle if both reflection coefficients are between -1 and 1.
     """
     return np.array([1.0, first * (1.0 + second), second])
 
 
 class Unknowns(NamedTuple):
-    """The numbers that nonlinear least squares finds."""
+    """The unknown parameters of the model that nonlinear least squares estimates."""
 
-    gain: float  # degC per t/h
-    delay: float  # samples
+    gain: float  # steady-state gain from flow to temperature, degC per t/h
+    delay: float  # delay of the flow response, samples, not necessarily an integer
     log_slow: float  # logarithm of the larger time constant in samples
-    # Reflection coefficients of the noise model C(z) / D(z).
+    # Reflection coefficients of the polynomials C and D of the noise model C / D.
     first_of_c: float = 0.0
     second_of_c: float = 0.0
     first_of_d: float = 0.0
@@ -123,39 +140,65 @@ class Unknowns(NamedTuple):
         return self.ratio * self.slow
 
     def respond(self, flows: Array) -> Array:
-        """Return the response of delay and lags, with gain 1, to flows of shape (rows, ...).
+        """Return the output of the delay and the lags, with gain 1, for changes of some flows.
 
-        The flows had the values of the first row since long before the log.
+        A change is the difference of a flow from the flow in the first row, with which the
+        plant is taken to have been at rest. `flows` and the result have the shape (rows, ...).
         """
         return respond(flows - flows[0], self.delay, self.slow, self.fast)
 
 
-# Limits of a search; `Fit.refined` adds upper limits of delay and time constant.
+# The limits between which `Fit.refined` looks for each unknown. The upper limits of the delay
+# and the time constant depend on the length of the log, and are set in `Fit.refined`.
 LOWEST = Unknowns(-np.inf, 0.0, np.log(0.25), -0.98, -0.98, -0.999, -0.999, 0.02)
 HIGHEST = Unknowns(np.inf, np.inf, np.inf, 0.98, 0.98, 0.999, 0.999, 0.97)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A model of a log.
+    """A model that is fitted to a log.
 
     The rows from `first_row` to `end_row` are divided into blocks of successive rows, and the
-    model is fitted to the means of the blocks. In a short log, a block is a row.
+    model is fitted to the mean of each block. In a log of fewer than `MOST_BLOCKS` rows, each
+    row is a block.
+
+    Attributes
+    ----------
+    log : Log
+        The log.
+    zones : list of DeadZone
+        The dead zones to choose from, those of half width 0 first.
+    unknowns : Unknowns
+        The estimates of gain, delay, time constants and noise model.
+    zone : DeadZone
+        The dead zone of the model.
+    load_steps : tuple of int
+        The rows at which an unmeasured load steps.
+    first_row : int
+        The first row that is fitted. The temperatures in earlier rows depend on flows from
+        before the log.
+    end_row : int, optional
+        The row behind the last one that is fitted; None for the end of the log.
+    standard_errors : Unknowns, optional
+        The standard error of each unknown, after `refined`.
     """
 
     log: Log
-    zones: list[DeadZone]  # possible dead zones; the first ones have no width
+    zones: list[DeadZone]
     unknowns: Unknowns
     zone: DeadZone
-    load_steps: tuple[int, ...] = ()  # rows at which an unmeasured load steps
-    first_row: int = 0  # temperatures before it depend on flows from before the log
-    end_row: int | None = None  # None: the end of the log
-    standard_errors: Unknowns | None = None  # of refined unknowns
+    load_steps: tuple[int, ...] = ()
+    first_row: int = 0
+    end_row: int | None = None
+    standard_errors: Unknowns | None = None
 
     def whiten(self, terms: Array) -> Array:
-        """Return D / C times the block means of terms, (rows, ...) to (blocks, ...).
+        """Return the means of signals over blocks of rows, filtered by D / C.
 
-        The first blocks have a small weight, because the filter settles in them.
+        The filter D / C turns noise of the noise model C / D into white noise. `terms` has
+        signals in its columns, shape (rows, ...); the result has the shape (blocks, ...). The
+        first `SETTLING_BLOCKS` blocks are multiplied by a small weight, because the filter has
+        not settled there.
         """
         unknowns = self.unknowns
         c = stable_polynomial(unknowns.first_of_c, unknowns.second_of_c)
@@ -171,12 +214,16 @@ class Fit:
 
     @cached_property
     def flow_response(self) -> Array:
-        """The response to the flow, degC, (rows,)."""
+        """The effect of the flow's changes on the temperature, degC, shape (rows,)."""
         return self.unknowns.gain * self.unknowns.respond(self.zone.passed(self.log.flow))
 
     @cached_property
     def background(self) -> Array:
-        """The terms of the background without coefficients, (rows, terms); 1 comes first."""
+        """The terms of the background before they are multiplied by `coefficients`.
+
+        The shape is (rows, terms). The background is the part of the temperature that is
+        neither noise nor an effect of the flow's changes. The first term is the constant 1.
+        """
         slow, fast = self.unknowns.slow, self.unknowns.fast
         rows = np.arange(len(self.log.flow), dtype=np.float64)
         elapsed = np.maximum(rows - self.first_row, 0.0)
@@ -185,8 +232,8 @@ class Fit:
             terms.append(np.exp(-elapsed / fast))
         steps = [(rows >= row).astype(np.float64) for row in self.load_steps]
         terms += [respond(step, 0.0, slow) for step in steps]
-        # The lags of a disturbance are unknown. The responses of three pairs of lags add up to
-        # nearly any smooth response.
+        # The lags between a disturbance and the temperature are unknown. A weighted sum of the
+        # step responses of three pairs of lags is close to nearly any smooth step response.
         changes = self.log.disturbances - self.log.disturbances[0]
         for multiple in DISTURBANCE_LAGS:
             terms += list(respond(changes, 0.0, slow, multiple * slow).T)
@@ -194,7 +241,7 @@ class Fit:
 
     @cached_property
     def coefficients(self) -> Array:
-        """The coefficients of the background by linear least squares, (terms,)."""
+        """The factors of the background's terms, by linear least squares, shape (terms,)."""
         terms = self.whiten(self.background)
         target = self.whiten(self.log.temperature - self.flow_response)
         sizes = np.linalg.norm(terms, axis=0) + TINY
@@ -202,19 +249,19 @@ class Fit:
 
     @cached_property
     def simulated(self) -> Array:
-        """The temperatures of the model without noise, degC, (rows,)."""
+        """The temperature of the model in each row of the log, without noise, degC, (rows,)."""
         return np.asarray(self.background @ self.coefficients + self.flow_response)
 
     @cached_property
     def errors(self) -> Array:
-        """The prediction errors, degC, (blocks,)."""
+        """The prediction error of each block of rows, degC, shape (blocks,)."""
         return self.whiten(self.log.temperature - self.simulated)
 
     @property
     def operating_temperature(self) -> float:
-        """The steady temperature at the centre of the dead zone, degC.
+        """The steady temperature of the model if the flow is the centre of the dead zone, degC.
 
-        The loads and the measured disturbances are those of the first row.
+        Loads and measured disturbances are taken to have the values of the first row.
         """
         first_flow = self.zone.passed(self.log.flow[:1])[0]
         change = self.unknowns.gain * (self.zone.centre - first_flow)
@@ -226,27 +273,33 @@ class Fit:
         return float(self.errors @ self.errors + TINY)
 
     def improvement(self, squares: Array | float) -> Array:
-        """Return how much better than this fit are fits with other sums of squared errors.
+        """Return how much better than this fit other fits are: positive where they are better.
 
-        The improvement is twice the logarithm of the ratio of the likelihoods. It has the shape
-        of `squares`, which are in degC^2.
+        The improvement is twice the logarithm of the ratio of the likelihoods of the other fit
+        and of this fit. `squares` has the sum of squared prediction errors of each other fit,
+        degC^2, and the result has the shape of `squares`.
         """
         return np.asarray(len(self.errors) * np.log(self.squares / (squares + TINY)))
 
     def with_candidates(self, target: Array, candidates: Array) -> tuple[Array, Array]:
-        """Fit the background and one candidate term to a target, for each of the candidates.
+        """Try some signals as an additional term of the model, one at a time.
+
+        For each candidate, linear least squares fits the sum of the background and a multiple
+        of the candidate to `target`.
 
         Parameters
         ----------
         target : array of shape (rows,)
-            What is fitted, degC.
+            The signal that is fitted, degC.
         candidates : array of shape (rows, candidates)
-            Candidate terms.
+            The signals that are tried, in any unit.
 
         Returns
         -------
-        squares, coefficients : arrays of shape (candidates,)
-            Sums of the squared prediction errors (degC^2), and coefficients of the candidates.
+        squares : array of shape (candidates,)
+            The sum of the squared prediction errors with each candidate, degC^2.
+        coefficients : array of shape (candidates,)
+            The best coefficient of each candidate, degC per unit of the candidate.
         """
         base = self.whiten(self.background)
         orthonormal = qr(base / (np.linalg.norm(base, axis=0) + TINY), mode="economic")[0]
@@ -254,13 +307,18 @@ class Fit:
         unexplained = whitened - orthonormal @ (orthonormal.T @ whitened)
         errors, terms = unexplained[:, 0], unexplained[:, 1:]
         powers = np.sum(terms**2, axis=0)
-        # A candidate that is a sum of terms of the background explains nothing more.
+        # A candidate that is a weighted sum of terms of the background cannot improve the fit.
         powers[powers <= 1e-10 * np.sum(whitened[:, 1:] ** 2, axis=0)] = np.inf
         products = terms.T @ errors
         return errors @ errors - products**2 / powers, products / powers
 
     def refined(self, evaluations: int = 25) -> "Fit":
-        """Return the fit whose unknowns have the least squared errors nearby."""
+        """Return this fit after nonlinear least squares, which improves all unknowns together.
+
+        The search starts from the unknowns of this fit and finds a local minimum of the sum of
+        squared prediction errors. The result also has `standard_errors`. `evaluations` is the
+        largest number of steps of the search.
+        """
         longest_delay = len(self.log.flow) / 6.0
         limit = HIGHEST._replace(delay=longest_delay, log_slow=np.log(2.0 * longest_delay))
         count = 8 if self.unknowns.ratio > 0.0 else 7  # a single lag has no ratio
@@ -276,7 +334,9 @@ class Fit:
             xtol=1e-5,
             max_nfev=evaluations,
         )
-        # The rows of the pseudo-inverse are as long as the roots of the inverse of J' J.
+        # With the Jacobian J, the covariance of the unknowns is the inverse of J' J times the
+        # variance of the errors. The lengths of the rows of the pseudo-inverse of J are the
+        # square roots of the diagonal of the inverse of J' J.
         lengths = np.linalg.norm(np.linalg.pinv(result.jac), axis=1)
         deviation = np.sqrt(np.mean(result.fun**2))
         standard_errors = Unknowns(*(deviation * lengths).tolist())
@@ -287,19 +347,26 @@ class Fit:
 def possible_zones(
     flow: Array, operating_flow: float | None = None, *, applied: bool = False
 ) -> list[DeadZone]:
-    """Return the dead zones that a flow (rows,) may have passed, those without width first.
+    """Return the dead zones that the valve of a log may have, those of half width 0 first.
 
-    All numbers are in t/h. The centre is the operating flow or, if that is None, in the range
-    of the flow. If the flow was measured behind the valve (`applied`), there is no dead zone.
+    Parameters
+    ----------
+    flow
+        The flow of the log, t/h, shape (rows,).
+    operating_flow
+        The centre of the dead zone, t/h; None if the centre is unknown. For an unknown centre,
+        the result has centres in the whole range of the flow.
+    applied
+        Whether the flow was measured behind the valve. If it was, all half widths are 0.
     """
     centres = np.linspace(flow.min(), flow.max(), GRID)
     if operating_flow is not None:
         centres = np.array([operating_flow])
     widest = np.abs(flow - centres.mean()).max()
     half_widths = np.linspace(0.0, widest, GRID)
-    # Flows that differ by less than 2 % of their range count as one level.
+    # Flows that differ by less than 2 % of their range count as equal.
     levels = np.unique(np.round(50.0 * (flow - flow.min()) / np.ptp(flow)))
-    if len(levels) < 3:  # They do not show the dead zone, which may have any width.
+    if len(levels) < 3:  # Two different flows cannot show how wide the dead zone is.
         half_widths = np.array([0.0, widest])
     if applied:
         half_widths = np.zeros(1)
@@ -309,16 +376,17 @@ def possible_zones(
 
 
 def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
-    """Return a fit without a dead zone and with one lag, from a search over delays and lags.
+    """Return a first fit of the model to a log, without a dead zone and with one lag.
 
-    See `identify` for the arguments.
+    The fit is the best of a grid of delays and time constants. `log`, `zones` and `end_row` are
+    the arguments of `identify`.
     """
     rows = len(log.flow)
     changes = log.flow - log.flow[0]
     delays = np.unique(np.geomspace(1.0, rows / 6.0, 30).round()) - 1.0
     fits = []
     for slow in np.geomspace(max(1.0, rows / 2000.0), rows / 8.0, 6):
-        # The noise often has the lag of the plant, which is where the search begins.
+        # The noise often has the time constant of the plant, so the search begins with it.
         start = Unknowns(0.0, 0.0, np.log(slow), first_of_d=-np.exp(-1.0 / slow))
         fit = Fit(log, zones, start, zones[0], end_row=end_row)
         responses = [respond(changes, delay, slow) for delay in delays.tolist()]
@@ -332,11 +400,12 @@ def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
 
 
 def try_zones(fit: Fit) -> pd.DataFrame:
-    """Return a table with a row for each possible dead zone of a fit.
+    """Return a table of fits with other dead zones, one row for each dead zone in `fit.zones`.
 
-    A row describes a new fit with this dead zone. The new fit has another gain and background;
-    all else is as in the old fit. The columns are centre and half_width (t/h), gain
-    (degC per t/h), and improvement (see `Fit.improvement`).
+    Gain and background are fitted anew for each dead zone, and all other parts of the model are
+    those of `fit`. The columns of the table are `centre` and `half_width` of the dead zone
+    (t/h), the new `gain` (degC per t/h), and `improvement`, which is the improvement over `fit`
+    as `Fit.improvement` defines it.
     """
     passed = np.column_stack([zone.passed(fit.log.flow) for zone in fit.zones])
     responses = fit.unknowns.respond(passed)
@@ -346,9 +415,10 @@ def try_zones(fit: Fit) -> pd.DataFrame:
 
 
 def with_zone(fit: Fit) -> Fit:
-    """Return a fit whose dead zone is the mean of the likeliest dead zones.
+    """Return `fit` with a new dead zone, the mean of the likeliest ones among `fit.zones`.
 
-    If the likeliest dead zones improve the fit too little, the dead zone has no width.
+    If the best dead zone improves a fit without a dead zone by less than the constant
+    `DEAD_ZONE`, the half width of the new dead zone is 0. The other unknowns are not changed.
     """
     table = try_zones(fit)
     most = table.improvement.max()
@@ -359,18 +429,22 @@ def with_zone(fit: Fit) -> Fit:
 
 
 def with_lags(fit: Fit) -> Fit:
-    """Return the fit, refined with two lags, or with one lag if two are hardly better."""
+    """Return `fit`, refined with two lags, or with one lag if two lags are hardly better.
+
+    Two lags are hardly better if they improve the fit by at most the constant `SECOND_LAG`.
+    """
     single = replace(fit, unknowns=fit.unknowns._replace(ratio=0.0)).refined()
-    # A second lag takes the place of a part of the delay.
+    # In a model with two lags, the second lag replaces a part of the delay of one lag.
     start = single.unknowns._replace(delay=0.7 * single.unknowns.delay, ratio=0.4)
     double = replace(single, unknowns=start).refined()
     return double if single.improvement(double.squares) > SECOND_LAG else single
 
 
 def with_load_steps(fit: Fit) -> Fit:
-    """Return a fit with the steps of unmeasured loads that improve the fit enough.
+    """Return `fit` with new steps of unmeasured loads, which replace the load steps of `fit`.
 
-    Steps of loads that the old fit had are searched for anew.
+    Steps are added one by one, always the step that improves the fit most, while a step
+    improves the fit by at least the constant `LOAD_STEP`, and up to `MOST_LOAD_STEPS`.
     """
     fit = replace(fit, load_steps=())
     slow = fit.unknowns.slow
@@ -390,16 +464,16 @@ def with_load_steps(fit: Fit) -> Fit:
 
 
 def identify(log: Log, zones: list[DeadZone], end_row: int | None = None) -> Fit:
-    """Return the refined fit of a log.
+    """Identify the plant of a log: return the best fit of the model to the log.
 
     Parameters
     ----------
     log : Log
-        The log, which may begin at any time.
+        The log. The plant need not be at rest in the first row.
     zones : list of DeadZone
-        The dead zones to choose from; see `possible_zones`.
+        The dead zones to choose from, as `possible_zones` returns them.
     end_row : int, optional
-        The fit leaves out the rows from this one on. By default, it leaves out none.
+        The model is fitted to the rows before this one; by default, to all rows.
     """
     fit = first_fit(log, zones, end_row)
     for _ in range(2):  # because the best dead zone depends on the lags and vice versa
@@ -408,10 +482,11 @@ def identify(log: Log, zones: list[DeadZone], end_row: int | None = None) -> Fit
 
 
 def estimates(fit: Fit) -> pd.DataFrame:
-    """Return the estimates of a refined fit with 95 % intervals, as a table of numbers.
+    """Return a table of the plant's estimated parameters with 95 % confidence intervals.
 
-    The rows are delay (samples), dead_zone (t/h), gain (degC per t/h) and time_constant (s);
-    the columns are value, low and high.
+    The rows are `delay` (samples), `dead_zone` (the half width, t/h), `gain` (degC per t/h) and
+    `time_constant` (the larger one, s). The columns are `value` and the ends of the interval,
+    `low` and `high`. `fit` must be a result of `Fit.refined` or `identify`.
     """
     values = fit.unknowns
     margins = Unknowns(*(2.0 * SPREAD * np.array(fit.standard_errors)))
@@ -451,11 +526,12 @@ def estimates(fit: Fit) -> pd.DataFrame:
 
 
 def explained_share(fit: Fit) -> float:
-    """Return how much of the last third of a log a fit to the first two thirds explains.
+    """Return how well a model of the first two thirds of a log predicts the last third.
 
-    This is a share of the variance of the temperature. The second fit is made anew, and
-    simulates the last third from the flow and the disturbances. The share is negative if a
-    constant explains more.
+    A new model is fitted to the first two thirds of the log of `fit`. The new model simulates
+    the temperature in the last third from the flow and the measured disturbances. The result is
+    the share of the variance of the temperature in the last third that the simulation explains:
+    1 for a perfect simulation, and below 0 for a simulation that is worse than a constant.
     """
     end_row = 2 * len(fit.log.flow) // 3
     earlier = identify(fit.log, fit.zones, end_row)
@@ -464,11 +540,23 @@ def explained_share(fit: Fit) -> float:
 
 
 def polynomials(fit: Fit, delay: int) -> tuple[Array, Array, Array, float]:
-    """Return A, B and C of (28), and the variance of xi (degC^2), for a delay in samples.
+    """Convert a fit to the form of equation (28) of the paper, with a delay in whole samples.
 
-    A and B are exact if the delay of the fit is up to one sample longer. If it is shorter, B
-    leaves out the response before the sample `delay + 1`. C and the variance give noise that
-    resembles the noise of the log.
+    A and B of equation (28) reproduce the flow response of the fit exactly if the delay of the
+    fit is at least `delay` samples and at most one sample longer. If the delay of the fit is
+    shorter, B leaves out the response before the sample `delay + 1`. C and the variance of the
+    white noise xi of equation (28) give noise that resembles the noise of the log.
+
+    Returns
+    -------
+    a : Array
+        The coefficients of the polynomial A, from z^0 on.
+    b : Array
+        The coefficients of the polynomial B, from z^-1 on, degC per t/h.
+    c : Array
+        The coefficients of the polynomial C, from z^0 on.
+    variance : float
+        The variance of the white noise xi, degC^2.
     """
     unknowns = fit.unknowns
     lags = np.array([unknowns.slow, unknowns.fast])

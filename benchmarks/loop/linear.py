@@ -1,13 +1,15 @@
-"""Describe the plant, and loops of a controller around the plant, as linear systems.
+"""Describe the plant, and the loop of a controller and the plant, as linear systems.
 
-A plant has a step test and a model for each sample of an episode; a loop has a robustness.
+The functions do a step test on a plant, and compute how robust a loop is. The plant is equation
+(28) of the paper with a load:
 
-Between the limits of the actuator (29) the plant is
+    y(k) = sum_i alpha_i y(k-1-i) + sum_i beta_i u_a(k-d-1-i) + C(z^-1) xi(k) + A(1) w(k),
 
-    (28)  y(k) = sum_i alpha_i y(k-1-i) + sum_i beta_i u_a(k-d-1-i) + C xi(k) + A(1) w(k),
-
-where w is the load, degC. The factors of gain and time constant, and their drifts, are part of
-alpha and beta.
+where i counts from 0, y is the temperature (degC), u_a the flow that the actuator applies
+(t/h), d the delay (samples), xi white noise (degC) and w the load (degC). The coefficients
+alpha_i and beta_i are those of the polynomials A and B of equation (28), after the factors and
+drifts of gain and time constant. Equation (29) of the paper is the actuator, with a dead zone
+and limits.
 """
 
 import math
@@ -25,36 +27,47 @@ from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
 
 Array = NDArray[np.float64]
 
-# Shares of the final value at which Smith's method reads a step response.
+# Smith's method reads the times at which a step response reaches these shares of its final
+# value. A lag with the time constant T reaches them after T / 3 and T.
 EARLY_LEVEL, LATE_LEVEL = 0.283, 0.632
-SLOWEST_POLE = 1 - 1e-5  # of a plant that settles within the samples of a step test
-TRANSIENT = 1e-5  # share of a transient that may remain at the end of a step test
-FREQUENCIES = np.geomspace(1e-4, math.pi, 400)  # rad per sample, for the sensitivity
-CIRCLE_POINTS = 1 << 14  # on the unit circle, to count unstable poles
+# Largest magnitude of a pole for which a step test is done: a step test would be too long for a
+# slower plant.
+SLOWEST_POLE = 1 - 1e-5
+TRANSIENT = 1e-5  # share of the slowest transient that may remain at the end of a step test
+# Frequencies at which the sensitivity function is computed, rad per sample; pi is the highest
+# frequency of a sampled signal.
+FREQUENCIES = np.geomspace(1e-4, math.pi, 400)
+CIRCLE_POINTS = 1 << 14  # points on the unit circle with which unstable poles are counted
 LONGEST_DELAY = 1000  # samples; longer delays are not examined for stability
-GRID = 24  # time constants that are tried before a bisection
-PRECISION = 1e-5  # relative, of a time constant that is solved for
+GRID = 24  # number of time constants that `time_constant_for` tries before the bisection
+PRECISION = 1e-5  # relative precision of the time constant that `time_constant_for` returns
 
 
 class LinearModel:
-    """The coefficients of (28) and the limits of (29) in the step to sample k.
+    """One plant or several plants, equation (28) of the paper, as linear systems at one sample.
+
+    The coefficients of a plant that drifts hold for the step from sample k - 1 to sample k.
+    A model can also have one plant at several samples k. In the shapes below, the dots stand
+    for the axis of the plants or of the samples, which is missing for one plant at one sample.
 
     Parameters
     ----------
     parameters
         The arguments of the environment.
     numbers
-        The plant numbers: floats for one plant, or arrays of shape (plants,).
+        Plant numbers, such as the delay: floats for one plant, or arrays of shape (plants,).
     k
         A sample; or, for one plant, several samples, shape (samples,).
 
     Attributes
     ----------
-    alpha, beta
-        alpha_i, and beta_i in degC per t/h, shapes (..., order of A) and (..., length of B).
-        The dots stand for plants, or for samples, or for neither.
+    alpha
+        Factors of the temperatures y(k-1), y(k-2), ... in y(k), shape (..., order of A).
+    beta
+        Factors of the applied flows u_a(k-d-1), u_a(k-d-2), ... in y(k), degC per t/h, shape
+        (..., length of B), where d is the delay in samples.
     load
-        A(1), degC of y(k) for each degC of load, shape (...).
+        Factor A(1) of the load w(k) in y(k), without a unit, shape (...).
     """
 
     def __init__(
@@ -76,13 +89,20 @@ class LinearModel:
 
     @property
     def gain(self) -> Array:
-        """Steady-state gain B(1) / A(1), degC per t/h; infinite for an integrating plant."""
+        """Steady-state gain, degC per t/h, shape (...); infinite for an integrating plant.
+
+        The gain is B(1) / A(1) with the polynomials A and B of equation (28) of the paper.
+        """
         with np.errstate(divide="ignore"):
             return np.asarray(self.beta.sum(axis=-1) / (1.0 - self.alpha.sum(axis=-1)))
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Lowest and highest flow of one plant, t/h; a dead zone makes 0 a possible flow."""
+        """Lowest and highest flow that the actuator of one plant can apply, t/h.
+
+        If the actuator has a dead zone, the flow 0 is possible even where it is outside the
+        range from `u_min` to `u_max`.
+        """
         flows = [self.numbers.u_min, self.numbers.u_max]
         if self.numbers.dead_zone > 0.0:
             flows.append(0.0)
@@ -90,17 +110,21 @@ class LinearModel:
 
     @property
     def lag(self) -> int:
-        """Samples from a flow of one plant to the first output that the flow can affect.
+        """Number of samples from a flow to the first output that the flow can affect.
 
-        If all coefficients of B are 0, it is as if the next coefficient were not 0.
+        The model must have one plant. Leading zeros in the polynomial B of equation (28) of the
+        paper make the lag longer. If all coefficients of B are 0, a further one is taken to be
+        other than 0.
         """
         first_nonzero = np.flatnonzero([*self.parameters.b, 1.0])[0]
         return int(self.numbers.delay) + 1 + int(first_nonzero)
 
     def impulse_response(self, samples: int) -> Array:
-        """Return the effects of a flow of 1 t/h at j on y(j + d + 1), y(j + d + 2) and so on.
+        """Return the impulse response of the plants, degC per t/h, shape (..., samples).
 
-        They are in degC per t/h, of shape (..., samples). The coefficients are held constant.
+        The first value is the effect of a flow of 1 t/h at one sample on the output d + 1
+        samples later, where d is the delay of the plant in samples. The coefficients of the
+        plant are taken to stay as they are. `samples` is the number of values.
         """
         response = np.zeros((*self.load.shape, samples))
         response[..., : self.beta.shape[-1]] = self.beta[..., :samples]
@@ -110,10 +134,17 @@ class LinearModel:
         return response
 
     def state_space(self) -> tuple[Array, Array]:
-        """Return F, shape (..., size, size), and g, shape (size,): x(k) = F x(k-1) + g xi(k).
+        """Return the matrices F and g of the state equation x(k) = F x(k-1) + g xi(k).
 
-        The state x(k) consists of y(k), y(k-1), ..., xi(k), xi(k-1), ...; flows and load are
-        left out.
+        The state x(k) consists of the latest outputs y(k), y(k-1), ... and the latest values
+        xi(k), xi(k-1), ... of the white noise; flows and load are left out.
+
+        Returns
+        -------
+        F : Array
+            The state transition matrix, shape (..., size, size).
+        g : Array
+            The effect of the noise, elements 0 and 1, shape (size,).
         """
         c = self.parameters.c
         order = max(self.alpha.shape[-1], 1)
@@ -126,25 +157,35 @@ class LinearModel:
 
 
 def nominal(parameters: Parameters) -> LinearModel:
-    """Return the model of the plant in the middle of all ranges, before any drift (k = 0)."""
+    """Return the model of the nominal plant, which is in the middle of all ranges of arguments.
+
+    `parameters` are the arguments of the environment. If the plant drifts, the model is that of
+    the sample k = 0.
+    """
     middle = {name: sum(parameters.range_of(name)) / 2 for name in PLANT_NUMBERS}
     return LinearModel(parameters, PlantNumbers(**middle), 0)
 
 
 def step_test(parameters: Parameters) -> dict[str, float]:
-    """Return what an engineer would read off the plant's response to a step of the flow.
+    """Return the gain, time constant and delay that an engineer reads off a step response.
 
-    The time constant and the delay follow from the times at which the response reaches 28.3 %
-    and 63.2 % of its final value: T = 1.5 (t_63 - t_28), and the delay is t_63 - T (C. L.
-    Smith, "Digital Computer Process Control", 1972). As if read off a chart, the gain has four
-    digits, the time constant three, and the delay is a whole number of samples; the delay
-    includes the one sample that any input takes to show.
+    The flow steps on the nominal plant, without noise. With the times t_28 and t_63 at which
+    the temperature has made 28.3 % and 63.2 % of its change, the time constant is
+    T = 1.5 (t_63 - t_28), and the delay is t_63 - T (C. L. Smith, "Digital Computer Process
+    Control", 1972). As if read off a chart, the gain is rounded to four digits, the time
+    constant to three digits, and the delay to a whole number of samples. The delay is the time
+    from a flow to the first output that the flow can affect.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment. The nominal plant is in the middle of all ranges.
 
     Returns
     -------
     dict
-        `gain`, degC per t/h, and `time_constant`, `delay` and `sampling_interval`, s: arguments
-        of `PIController.simc` and `SmithPredictor`.
+        `gain`, degC per t/h, and `time_constant`, `delay` and `sampling_interval`, s. The names
+        are those of the arguments of `PIController.simc` and `SmithPredictor`.
 
     Raises
     ------
@@ -179,45 +220,62 @@ def step_test(parameters: Parameters) -> dict[str, float]:
 
 
 def _time_of(level: float, response: Array) -> float:
-    """Return when a step response first reaches a level, samples, by linear interpolation."""
+    """Return the time at which a step response first reaches `level`, in samples.
+
+    `response` has the step response at the samples 0, 1, ..., and begins below `level`. The
+    time is found by linear interpolation between two samples.
+    """
     k = int(np.argmax(response >= level))
     share = (level - response[k - 1]) / (response[k] - response[k - 1])
     return float(k - 1 + share)
 
 
 class LinearController(Protocol):
-    """A controller that is linear away from the dead zone and the limits."""
+    """A controller that is linear for commands outside the dead zone and within the limits."""
 
     def transfer(self) -> tuple[Array, Array]:
-        """Return numerator and denominator from e, degC, to u, t/h.
+        """Return the transfer function from the error e (degC) to the command u (t/h).
 
-        They are the coefficients of z^0, z^-1 and so on.
+        The result is a numerator and a denominator, each an array of the coefficients of z^0,
+        z^-1, z^-2 and so on.
         """
 
 
 @dataclass(frozen=True)
 class LinearLoop:
-    """A linear controller around a plant, away from the dead zone and the limits.
+    """The closed loop of a linear controller and a plant, without dead zone and limits.
 
-    A transfer function is a numerator and a denominator: coefficients of z^0, z^-1 and so on.
+    Attributes
+    ----------
+    controller : tuple of Array
+        Numerator and denominator of the transfer function from the error e (degC) to the
+        command u (t/h): coefficients of z^0, z^-1 and so on.
+    plant : tuple of Array
+        Numerator and denominator of the transfer function from u to the temperature y (degC)
+        without the delay: the polynomials B and A of equation (28) of the paper, as
+        coefficients of z^0, z^-1 and so on.
+    delay : int
+        The delay d of equation (28), samples.
     """
 
-    controller: tuple[Array, Array]  # from e, degC, to u, t/h
-    plant: tuple[Array, Array]  # from u to y without the delay: B(z^-1) and A(z^-1) of (28)
-    delay: int  # the plant's d, samples
+    controller: tuple[Array, Array]
+    plant: tuple[Array, Array]
+    delay: int
 
     @classmethod
     def of(cls, controller: LinearController, plant: LinearModel) -> "LinearLoop":
-        """Return the loop of a controller and one plant."""
+        """Return the closed loop of `controller` and `plant`, which must be a single plant."""
         numerator = np.append(0.0, plant.beta)
         denominator = np.append(1.0, -plant.alpha)
         delay = round(plant.numbers.delay)
         return cls(controller.transfer(), (numerator, denominator), delay)
 
     def characteristic(self, delay: int) -> Array:
-        """Return the polynomial in z^-1 whose roots are the inverse poles of the loop.
+        """Return the characteristic polynomial of the loop for any delay of the plant.
 
-        `delay` is the plant's d, samples. The coefficients begin with that of z^0.
+        The result has the coefficients of z^0, z^-1, z^-2 and so on. The poles of the loop are
+        the values of z at which the polynomial is 0. `delay` is the delay d of the plant,
+        samples.
         """
         numerator, denominator = self.controller
         b, a = self.plant
@@ -225,14 +283,15 @@ class LinearLoop:
         return np.asarray(polyadd(np.convolve(denominator, a), forward), np.float64)
 
     def largest_pole(self) -> float:
-        """Return the largest modulus of the poles; the loop is stable if it is below 1."""
+        """Return the largest modulus of a pole of the loop; below 1, the loop is stable."""
         return float(np.abs(np.roots(self.characteristic(self.delay))).max())
 
     def is_stable(self, delay: int) -> bool:
-        """Return whether all poles lie inside the unit circle, with a delay d in samples.
+        """Return whether the loop is stable if the delay d of the plant is `delay` samples.
 
-        By the argument principle, the polynomial in z^-1 turns about 0 once for each pole
-        outside the unit circle, while z^-1 goes around this circle once.
+        A loop is stable if all poles lie inside the unit circle. By the argument principle,
+        while z^-1 goes around the unit circle once, the characteristic polynomial turns about 0
+        once for each pole outside the circle.
         """
         values = np.fft.fft(self.characteristic(delay), CIRCLE_POINTS)
         if not values.all():  # a pole on the circle
@@ -241,7 +300,11 @@ class LinearLoop:
         return bool(round(turns) == 0)
 
     def sensitivity(self) -> float:
-        """Return Ms, the largest magnitude of 1 / (1 + L); infinite for an unstable loop."""
+        """Return the maximum sensitivity Ms of the loop; infinite for an unstable loop.
+
+        Ms is the largest magnitude of the sensitivity function 1 / (1 + L) over the
+        `FREQUENCIES`, where L is the open loop of controller and plant.
+        """
         if not self.is_stable(self.delay):
             return math.inf
         inverse_z = np.exp(-1j * FREQUENCIES)
@@ -251,11 +314,12 @@ class LinearLoop:
         return float(np.abs(ratio).max())
 
     def stable_delays(self) -> tuple[int, int] | None:
-        """Return the shortest and the longest delay d, samples, of a range of stable loops.
+        """Return the shortest and the longest delay of the plant with which the loop is stable.
 
-        The loop is stable with all delays of the range, which includes the plant's. The longest
-        delay that is examined is `LONGEST_DELAY`. None is returned if the loop is unstable with
-        the plant's delay.
+        The delays are values of the delay d of equation (28) of the paper, samples. The loop is
+        stable with all delays between the two, among which is the plant's own delay. Delays
+        above `LONGEST_DELAY` are not examined. The result is None if the loop is unstable with
+        the plant's own delay.
         """
         if not self.is_stable(self.delay):
             return None
@@ -274,26 +338,28 @@ def time_constant_for(
     slowest: float,
     fastest: float,
 ) -> float:
-    """Return the smallest time constant with which the Ms of a loop is at most a target, s.
+    """Return the smallest time constant with which a loop is robust enough, s.
 
-    All slower time constants that were tried meet the target, too.
+    A loop is robust enough if Ms, its maximum sensitivity, is at most `target`. All larger time
+    constants that were tried make the loop robust enough, too.
 
     Parameters
     ----------
     target
         The largest Ms that is allowed.
     make
-        Returns the controller for a time constant, s. A larger one makes a more robust loop.
+        Takes a time constant, s, and returns a controller with this time constant. A larger
+        time constant makes the loop more robust.
     plant
-        One plant.
+        The model of a single plant.
     slowest, fastest
-        The largest and the smallest time constant that are examined, s. If `fastest` meets the
-        target, it is returned.
+        The largest and the smallest time constant that are tried, s. If the loop is robust
+        enough with all time constants that are tried, the result is `fastest`.
 
     Raises
     ------
     ValueError
-        If `slowest` does not meet the target.
+        If the loop is not robust enough with the time constant `slowest`.
     """
 
     def meets_target(time_constant: float) -> bool:

@@ -1,4 +1,4 @@
-"""Roll out a controller on a batch of plants, and measure its runs."""
+"""Run a controller on a batch of plants, and compute measures of the runs, such as errors."""
 
 import itertools
 import math
@@ -18,34 +18,41 @@ from mptc_gym.scoring.rollout import rollout as run_batch
 
 Array = NDArray[np.float64]
 
-SETTLING_BAND = 0.05  # fraction of the set-point change, or of the set point
-START = 300  # samples that count as the start of a run
-CHANGE = 60  # samples that count as a response to a change of the set point
-LAST = 50  # samples at the end of a run that decide whether it has settled
+# Largest error of a settled output, divided by the set-point change (in `measure`) or by the
+# set point (in `settled`).
+SETTLING_BAND = 0.05
+START = 300  # samples that count as the start of a run: half a period of the square wave
+CHANGE = 60  # samples after a set-point change that count as the response to the change
+LAST = 50  # samples at the end of a run whose errors decide whether the output has settled
 
 
 class Agent(Protocol):
-    """The interface of a controller in a rollout."""
+    """The interface of a controller that `rollout` runs on a batch of plants."""
 
     def reset(self) -> None:
         """Prepare for a new episode."""
 
     def act(self, observation: Any) -> Any:
-        """Return actions, shape (runs, 1), for observations, shape (runs, n_obs)."""
+        """Return the actions of one sample, from -1 to 1, shape (runs, 1).
+
+        `observation` has the observations of the environment, shape (runs, elements).
+        """
 
 
 class IdleValve:
-    """No control: the valve stays at 0 t/h.
+    """A controller that keeps the flow at 0 t/h, for comparison with other controllers.
 
-    `u_min` and `u_max` are the limits of the actuator, t/h, of shape (runs,) or the same for
-    all runs.
+    Parameters
+    ----------
+    u_min, u_max
+        The limits of the actuator, t/h: arrays of shape (runs,), or numbers for all runs.
     """
 
     def __init__(self, u_min: Any = -10.0, u_max: Any = 10.0) -> None:
         self.action = np.reshape(action_from_command(0.0, u_min, u_max), (-1, 1))
 
     def reset(self) -> None:
-        """Remember nothing."""
+        """Prepare for a new episode: an idle valve has nothing to forget."""
 
     def act(self, observation: NDArray[np.float32]) -> Array:
         """Return the actions that keep the flow at 0 t/h, shape (runs, 1)."""
@@ -54,31 +61,44 @@ class IdleValve:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The signals of a batch of runs, k = 0 to N - 1; every array has shape (N, runs)."""
+    """The signals of a batch of runs at the samples k = 0 to N - 1, each of shape (N, runs)."""
 
-    setpoint: Array  # y_d(k), degC
-    output: Array  # y(k), degC
-    command: Array  # u(k), t/h
-    applied: Array  # u_a(k), t/h
-    next_error: Array  # e(k + 1), degC, which the reward of sample k is for
-    next_setpoint: Array  # y_d(k + 1), degC
+    setpoint: Array  # the set point y_d(k), degC
+    output: Array  # the temperature y(k), degC
+    command: Array  # the commanded flow u(k), t/h
+    applied: Array  # the flow u_a(k) that the actuator applies, t/h
+    next_error: Array  # the error e(k + 1), degC, which decides the reward of the step from k
+    next_setpoint: Array  # the set point y_d(k + 1), degC
 
     def __getitem__(self, samples: slice) -> "Trajectory":
-        """Return the trajectory of a slice of the samples."""
+        """Return the signals at the samples of a slice, such as `trajectory[-50:]`."""
         return Trajectory(*(signal[samples] for signal in vars(self).values()))
 
 
 def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
-    """Return a vector environment of `num_envs` plants with episodes of `samples` samples."""
+    """Return a vector environment of `num_envs` plants with episodes of `samples` samples.
+
+    `arguments` are the keyword arguments of the environment `MiddlePoint-v0`.
+    """
     return gymnasium.make_vec(
         "MiddlePoint-v0", num_envs=num_envs, max_episode_steps=samples, **arguments
     )
 
 
 def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[Array]:
-    """Return the plant numbers of run i = 0 to runs - 1, as drawn with the seed `seed + i`.
+    """Return the plant numbers that the environment draws for the runs of a batch.
 
-    Each number is an array of shape (runs,), also if it is the same for all runs.
+    Each plant number, such as the delay, is an array of shape (runs,), also if it is the same
+    in all runs.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment, with the ranges.
+    runs
+        Number of runs in the batch.
+    seed
+        Seed of the first run: the seed of run i is `seed + i`.
     """
     numbers = Ranges(parameters).lowest.chosen(PLANT_NUMBERS)
     if parameters.ranges:
@@ -91,7 +111,10 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
 
 
 def is_random(parameters: Parameters) -> bool:
-    """Return whether anything is drawn for an episode, even if only its noise."""
+    """Return whether the environment uses random numbers, so that episodes differ.
+
+    The random numbers can be those of the noise, the load, the set point or the plant.
+    """
     _, largest_noise = parameters.range_of("noise_variance")
     _, largest_measurement_noise = parameters.range_of("measurement_noise_variance")
     return (
@@ -110,20 +133,22 @@ def rollout(
     seed: int,
     before: Callable[[int], object] | None = None,
 ) -> Trajectory:
-    """Run a controller on a batch of plants for k = 0 to samples - 1. Both are reset first.
+    """Reset a controller and a batch of plants, run them together, and return the signals.
 
     Parameters
     ----------
     plants
-        A vector environment.
+        The plants, a vector environment.
     agent
-        The controller.
+        The controller, which acts at the samples k = 0 to `samples - 1`.
     samples
-        Length of the runs.
+        Length of a run, in samples.
     seed
-        Run i has the noise and the set point of seed `seed + i`.
+        Seed of the first run: the environment draws the random numbers of run i, such as its
+        noise, with the seed `seed + i`.
     before
-        Called with k before the controller acts at sample k, to observe or to damage it.
+        Function that is called with k before the controller acts at sample k, for example to
+        record or to change the weights of a network.
     """
     clock = itertools.count()
 
@@ -155,21 +180,23 @@ def rollout(
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """Return the measures of each run by their names in CSV files, each of shape (runs,).
 
-    `parameters` are the arguments of the environment in which the controller ran.
+    `parameters` are the arguments of the environment in which the controller ran. With the
+    error e(k) at the samples k = 1 to N, the measures are:
 
-    - `mae`: mean of |e(k)| over k = 1 to N, degC;
-    - `mae_start`, `mae_changes`, `mae_steady`: three parts, degC, whose sum is `mae`: the part
-      of the samples before `START`, the part of the later samples that lie less than `CHANGE`
-      after a change of the set point, and the part of the remaining samples;
-    - `ise`: integral of e^2 over k = 1 to N, degC^2 min;
-    - `itae`: integral of t |e|, degC min^2, with t counted from the latest set-point change;
-    - `total_variation`: valve travel, the total variation of the applied flow, from rest at 0,
-      t/h;
-    - `overshoot`: excursion of the output beyond the new set point, as a percentage of the
-      set-point change; the largest over all changes;
+    - `mae`: mean of |e(k)|, degC;
+    - `mae_start`, `mae_changes`, `mae_steady`: the contributions of three parts of the run to
+      `mae`, degC: of the samples before `START`, of the later samples that lie less than
+      `CHANGE` samples after a change of the set point, and of the remaining samples;
+    - `ise`: integral of e^2 over time, degC^2 min;
+    - `itae`: integral of t |e| over time, degC min^2, where t is the time since the latest
+      set-point change;
+    - `total_variation`: valve travel, the sum of all changes of the applied flow, t/h, the
+      first of them from 0 t/h;
+    - `overshoot`: largest distance of the output beyond a new set point, in percent of the
+      set-point change; the maximum over all changes;
     - `settling_time`: time from a set-point change until the error stays within `SETTLING_BAND`
-      of the change, min; the longest over all changes, infinite if the output has not settled
-      by the next change or the end of the run;
+      times the change, min; the maximum over all changes, and infinite if the output has not
+      settled before the next change or the end of the run;
     - `dead_zone_share`: share of samples with the command inside the dead zone, %;
     - `saturation_share`: share of samples with the command at or beyond a limit, %.
 
@@ -195,7 +222,10 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
 
 
 def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
-    """Return the three parts of the mean error by name, degC, each of shape (runs,)."""
+    """Return the contributions of three parts of each run to the mean error, degC, by name.
+
+    `measure` describes the names. Each array has the shape (runs,).
+    """
     errors = np.abs(trajectory.next_error)
     k = np.arange(1, len(errors) + 1)[:, np.newaxis]
     setpoint_moves = np.diff(trajectory.next_setpoint, axis=0, prepend=trajectory.setpoint[:1])
@@ -212,13 +242,14 @@ def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
 def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]:
     """Return the shares of commands in the dead zone and at a limit, %, each of shape (runs,).
 
-    `command` is in t/h, of shape (N, runs).
+    `command` has the commanded flows, t/h, shape (samples, runs). The shares are NaN if the
+    dead zone or a limit in `parameters` is a range.
     """
     if {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
         unknown = np.full(command.shape[1], np.nan)
         return {"dead_zone_share": unknown, "saturation_share": unknown}
     u_min, u_max = parameters.u_min, parameters.u_max
-    # The smallest command, t/h, that the plant does not take to be inside the dead zone.
+    # The smallest magnitude of a command, t/h, that the plant treats as outside the dead zone.
     edge = least_effective(parameters.dead_zone, u_min, u_max)
     is_inside = np.abs(command) < edge
     is_at_limit = (command <= u_min) | (command >= u_max)
@@ -229,15 +260,18 @@ def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]
 
 
 class _Steps(NamedTuple):
-    """Measures of the responses to the steps of the set point in one run; see `measure`."""
+    """Measures of one run that are counted from the latest set-point change; see `measure`."""
 
-    itae: float  # degC samples^2
-    overshoot: float  # share of the step
-    settling: float  # samples
+    itae: float  # integral of time times |error|, degC samples^2
+    overshoot: float  # largest overshoot, divided by the set-point change
+    settling: float  # longest settling time, samples; infinite if the output does not settle
 
 
 def _measure_steps(setpoint: Array, output: Array) -> _Steps:
-    """Return the measures of one run from y_d(k) and y(k), degC, each of shape (N,)."""
+    """Return the measures of one run that are counted from the latest set-point change.
+
+    `setpoint` and `output` have the set point and the temperature, degC, shape (samples,).
+    """
     itae = 0.0
     overshoot = 0.0
     settling = 0.0
@@ -260,23 +294,29 @@ def _measure_steps(setpoint: Array, output: Array) -> _Steps:
 
 
 def held(setpoint: Array) -> list[tuple[int, int]]:
-    """Return the stretches of constant set point, as the slices start:stop of the samples.
+    """Return the stretches of one run in which the set point is constant.
 
-    `setpoint` is y_d(k), degC, of one run, shape (samples,).
+    A stretch (start, stop) consists of the samples k = start to stop - 1. `setpoint` has the
+    set point of the run, degC, shape (samples,).
     """
     changes = np.flatnonzero(np.diff(setpoint)) + 1
     return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
 
 
 def mean_error(trajectory: Trajectory) -> Array:
-    """Return the mean of |e(k)| over k = 1 to N of each run, degC, shape (runs,)."""
+    """Return the mean absolute error of each run in `trajectory`, degC, shape (runs,).
+
+    The mean is over the samples k = 1 to N: the error at k = 0 does not depend on the
+    controller.
+    """
     return np.asarray(np.abs(trajectory.next_error).mean(axis=0))
 
 
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
-    """Return whether each run has settled, shape (runs,).
+    """Return whether the output of each run has settled at the end of the run, shape (runs,).
 
-    A run has settled if its last `LAST` errors are all within `SETTLING_BAND` of the set point.
+    The output has settled if the last `LAST` errors of the run are all within `SETTLING_BAND`
+    times the set point.
     """
     setpoint = trajectory.setpoint[-LAST:]
     output = trajectory.output[-LAST:]

@@ -1,6 +1,6 @@
-"""Define the cases, the options that choose a plant, and random designs of plants.
+"""Define the cases of comparisons, the options that choose a plant, and random plants.
 
-A case is a plant, a set point and a length. A design is a list of plants around one plant.
+A case (a scenario in the code) is a plant, a set point and a length of the runs.
 """
 
 import json
@@ -18,12 +18,25 @@ from benchmarks.loop.linear import nominal
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.parameters import slowest_pole
 
-Arguments = dict[str, Any]  # of the environment
+Arguments = dict[str, Any]  # keyword arguments of the environment `MiddlePoint-v0`
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A case: the length of a run, and arguments of the environment beyond the defaults."""
+    """A case: a plant, a set point and a length of the runs.
+
+    Attributes
+    ----------
+    name : str
+        The name of the case in options and files.
+    title : str
+        The name of the case in reports and pictures.
+    samples : int
+        Length of a run, in samples.
+    arguments : dict
+        The arguments of the environment that define the plant and the set point. All other
+        arguments have their defaults.
+    """
 
     name: str
     title: str
@@ -32,7 +45,7 @@ class Scenario:
 
     @property
     def parameters(self) -> Parameters:
-        """All arguments of the environment."""
+        """All arguments of the environment, those with default values included."""
         return Parameters(**self.arguments)
 
 
@@ -85,7 +98,8 @@ SCENARIOS = {
         600,
         {**PRESETS["noisy"], **_CONSTANT},
     ),
-    # A boiler's daily duty. At 5 degC the required flow stays outside the dead zone.
+    # Rejecting load steps is the usual work of a boiler's controller. At a set point of 5 degC,
+    # the flow that the controller needs stays outside the dead zone.
     "load": Scenario(
         "load",
         "load steps within ±1.5 °C at a held set point, dead zone 5 t/h, no noise",
@@ -116,12 +130,12 @@ class PlantOptions:
 
     @property
     def name(self) -> str:
-        """Short description of the choice; "" for the paper's plant."""
+        """Short description of the chosen plant; "" if no option chooses a plant."""
         file = self.plant.stem if self.plant else None
         return ", ".join(filter(None, [self.preset, file, *self.set]))
 
     def words(self) -> list[str]:
-        """Return the words of a command line that choose the same plant."""
+        """Return the words of a command line, such as "--preset", "hard", for these options."""
         words: list[str] = []
         if self.preset:
             words += ["--preset", self.preset]
@@ -134,8 +148,9 @@ class PlantOptions:
     def cases(self, default: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
         """Return the cases of the chosen plant by name, or `default` if no plant is chosen.
 
-        The cases have the set points of the paper's cases. If the arguments of the plant define
-        a set point, there is one case, with that set point.
+        There is one case for each of the `SETPOINTS`, called "square" and "constant". But if
+        the user's arguments of the plant define a set point, there is one case with this set
+        point, called "run".
         """
         arguments = self.arguments()
         if not self.name:
@@ -154,9 +169,10 @@ class PlantOptions:
         }
 
     def arguments(self) -> Arguments:
-        """Return the arguments of the environment that differ from the defaults.
+        """Return the arguments of the environment that the user has chosen.
 
-        A `UsageError` names the option if an argument is unknown or invalid.
+        `--set` overrides `--plant`, which overrides `--preset`. A `UsageError` names the option
+        if an argument of the environment is unknown or invalid, or if the plant is unstable.
         """
         arguments: Arguments = {}
         if self.preset:
@@ -187,8 +203,8 @@ class PlantOptions:
         return arguments
 
 
-# Ranges of the random plants of sweeps, by argument of the environment. With a gain factor
-# below 0.74, a set point of 5 degC is out of the flow's reach.
+# Ranges of the random plants that `benchmarks.sweep` runs, by argument of the environment. With
+# a gain factor below 0.74, the largest flow could not keep the temperature at 5 degC.
 SPANS = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),
@@ -196,16 +212,24 @@ SPANS = {
     "gain_factor": (0.75, 1.6),
     "time_constant_factor": (0.5, 2.0),
 }
-# The factors that drift in half of the plants, and the argument for the drift of each factor.
+# The factors that drift in half of the random plants, and the argument for each factor's drift.
 DRIFTS = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_drift"}
 
 
 def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
-    """Return `count` plants from a Latin hypercube over `SPANS`.
+    """Return random plants from a Latin hypercube over the ranges `SPANS`.
 
-    The second half of the plants drift: over `samples` samples, the factors of gain and time
-    constant move to other values within `SPANS`. A plant is a dictionary of arguments of the
-    environment. `seed` is the seed of the hypercube.
+    A plant is a dictionary of arguments of the environment. The second half of the plants
+    drift: the factors of gain and time constant move to other values within `SPANS`.
+
+    Parameters
+    ----------
+    count
+        Number of plants.
+    seed
+        Seed of the Latin hypercube.
+    samples
+        Duration of the drifts, in samples.
     """
     from scipy.stats.qmc import LatinHypercube  # here: slow to import
 
@@ -228,11 +252,19 @@ def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
 
 
 def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
-    """Return a design around the paper's plant, moved to another plant.
+    """Convert random plants that vary the paper's plant to variations of another plant.
 
-    The moved plants differ from `plant` by the same factors as the plants of the design differ
-    from the paper's: in delay, dead zone, and the factors of gain and time constant. The noise
-    variance keeps its ratio to the square of the temperature change that the flow can cause.
+    In delay, dead zone, gain factor and time constant factor, each returned plant differs from
+    `plant` by the ratios by which the plant in `design` differs from the paper's plant. The
+    noise variance keeps its ratio to the square of the temperature change that the flow can
+    cause.
+
+    Parameters
+    ----------
+    plant
+        The arguments of the environment for the other plant.
+    design
+        The arguments of the environment for each random plant, as `random_design` returns them.
     """
     scales = _scales(Parameters(**plant))
     paper_scales = _scales(Parameters())
@@ -249,7 +281,12 @@ def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
 
 
 def _scales(plant: Parameters) -> dict[str, float]:
-    """Return the numbers of a plant that the values of a design scale with, by argument."""
+    """Return the quantity of a plant to which each argument in `SPANS` is proportional.
+
+    For the noise variance, the quantity is the square of the temperature change by half the
+    range of the flow, degC^2. For any other argument, it is the argument's value, in the middle
+    of the argument's range.
+    """
     model = nominal(plant)
     reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0  # degC
     scales = {**vars(model.numbers), "noise_variance": reach**2}

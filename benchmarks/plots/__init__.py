@@ -1,1 +1,1 @@
-"""Draw the pictures of sweeps and the film."""
+"""Draw the pictures of sweeps, which compare controllers on many plants."""

@@ -1,6 +1,8 @@
-"""Draw the results of a sweep: a map of a grid of plants, or the plants sorted by error.
+"""Draw the results of a sweep, which runs controllers on many plants.
 
-The title of each picture states what its data show.
+Plants that differ in delay and gain are drawn as a map, and other plants as a curve of the
+sorted errors. An error ratio is a mean error divided by the least possible mean error. The
+title of a picture is a sentence on the results in it.
 """
 
 from __future__ import annotations
@@ -28,27 +30,32 @@ from benchmarks.lib.pictures import (
 )
 from mptc_gym import Parameters
 
-NEAR = 1.05  # An error counts as near the least possible one up to this multiple.
-OFTEN = 0.5  # share of the runs on a plant from which on a mark of the map is drawn
+NEAR = 1.05  # largest error ratio that counts as near the least possible error
+OFTEN = 0.5  # smallest share of the runs on a plant that fail for a mark in the map
 CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
-COLOUR_MAP = "viridis_r"
+COLOUR_MAP = "viridis_r"  # light for small error ratios, dark for large ones
 NO_RATIO = "0.85"  # colour of a plant without a least possible error
+# The mark of a plant on which the loop oscillates.
 OSCILLATES: Any = {"color": "white", "marker": "o", "mec": "black", "ms": 3, "linestyle": ""}
 USELESS = "#E31A1C"  # colour of a plant on which control is no better than an idle valve
+# The mark of the nominal plant.
 NOMINAL: Any = {"color": "black", "marker": "+", "ms": 12, "mew": 1.8, "linestyle": ""}
 
 
 def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
-    """Draw a map of plants that differ in delay and gain alone, or else the sorted errors.
+    """Draw the results of a sweep, as a map or as a curve of the sorted errors.
+
+    A map is drawn if the plants differ in delay and gain only.
 
     Parameters
     ----------
     runs : pandas.DataFrame
-        A row for each run, as `sweep.table` returns it.
+        A row for each run, as `benchmarks.sweep.table` returns it. The table has a column
+        "dead_zone" if the plants differ in more than delay and gain.
     path : Path
         The PNG file.
     nominal : Parameters
-        The plant from which the other plants differ.
+        The nominal plant, of which all other plants are variations.
     """
     plants = plant_medians(runs)
     if "dead_zone" in runs:
@@ -58,11 +65,12 @@ def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
 
 
 def plant_medians(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a row for each controller and plant, controllers with smaller errors first.
+    """Return a table with a row for each controller and plant, the best controller first.
 
-    The columns are `agent`, `plant`, `delay`, `gain_factor`, `ratio` (that of the median run)
-    and the shares of runs that oscillate (`oscillates`) and that are no better than an idle
-    valve (`useless`). `runs` are those of `draw`.
+    The columns are `agent` (the controller), `plant`, `delay` (samples), `gain_factor`, `ratio`
+    (the median error ratio of the runs), `oscillates` (the share of the runs that oscillate)
+    and `useless` (the share of the runs whose error is no smaller than that of an idle valve).
+    `runs` is the argument of `draw`.
     """
     groups = runs.groupby(["agent", "plant"], sort=False)
     plants = groups[["delay", "gain_factor"]].first()
@@ -74,9 +82,10 @@ def plant_medians(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
-    """Draw the error ratios of each controller over the plants, sorted by the ratio.
+    """Draw a curve of the sorted error ratios of the plants for each controller.
 
-    `plants` are those of `plant_medians`. Plants without a ratio are left out.
+    `plants` is the table of `plant_medians`, and `path` is the PNG file. Plants without an
+    error ratio, whose least possible error is unknown, are left out.
     """
     plants = plants.dropna(subset=["ratio"])
     styles = looks(list(plants["agent"].unique()))
@@ -97,9 +106,10 @@ def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
 
 
 def sorted_finding(plants: pd.DataFrame) -> str:
-    """Return a sentence on the 90th percentiles of the error ratios over the plants.
+    """Return the title of the curves: a sentence on 90th percentiles of the error ratios.
 
-    It names the two controllers with the smallest percentiles and the one with the largest.
+    The sentence names the two controllers with the smallest 90th percentiles over the plants,
+    and the controller with the largest one. `plants` is the table of `plant_medians`.
     """
     ratios = plants.groupby("agent")["ratio"].quantile(0.9).sort_values()
     if ratios.empty:
@@ -113,9 +123,16 @@ def sorted_finding(plants: pd.DataFrame) -> str:
 
 
 def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
-    """Draw the error ratio over delay and gain, a panel for each controller, the best first.
+    """Draw maps of the error ratio over delay and gain, one map for each controller.
 
-    `plants` are those of `plant_medians`, and `nominal` is marked.
+    Parameters
+    ----------
+    plants
+        The table of `plant_medians`. The maps have the order of the controllers in the table.
+    path
+        The PNG file.
+    nominal
+        The nominal plant, which each map marks.
     """
     agents = list(plants["agent"].unique())
     names = [label(agent) for agent in agents]
@@ -138,9 +155,10 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
 
 
 def map_finding(plants: pd.DataFrame) -> str:
-    """Return a sentence on the shares of plants with nearly the least possible error.
+    """Return the title of the maps: a sentence on plants with nearly the least possible error.
 
-    It names the two controllers with the largest shares.
+    The sentence names the two controllers that have an error ratio of at most `NEAR` on the
+    largest shares of the plants. `plants` is the table of `plant_medians`.
     """
     with_ratio = plants.dropna(subset=["ratio"])
     is_near = with_ratio["ratio"] <= NEAR
@@ -162,9 +180,16 @@ def map_finding(plants: pd.DataFrame) -> str:
 
 
 def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) -> None:
-    """Draw a cell for each plant, in the colour of its error ratio, and marks for failures.
+    """Draw the map of one controller: a cell for each plant, and marks where control fails.
 
-    `plants` are the rows of one controller; `classes` maps a ratio to a colour.
+    Parameters
+    ----------
+    axes
+        The panel of the map.
+    plants
+        The rows of `plant_medians` of one controller.
+    classes
+        The normalisation that maps an error ratio to a colour.
     """
     cells = plants.pivot(index="gain_factor", columns="delay", values=["ratio", "useless"])
     ratios = cells["ratio"]
@@ -178,7 +203,10 @@ def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) ->
 
 
 def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
-    """Return the marks that are in a map, by their texts."""
+    """Return the marks that occur in the maps, as artists for the legend, by their texts.
+
+    `plants` is the table of `plant_medians` with all controllers.
+    """
     entries: dict[str, Artist] = {"the nominal plant": Line2D([], [], **NOMINAL)}
     if (plants["oscillates"] >= OFTEN).any():
         entries["oscillates"] = Line2D([], [], **OSCILLATES)
