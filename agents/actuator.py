@@ -1,4 +1,4 @@
-"""Model the actuator (29), and choose commands that have an effect."""
+"""Model the actuator, equation (29) of the paper, and choose commands that have an effect."""
 
 from typing import Any
 
@@ -9,18 +9,39 @@ Array = NDArray[np.float64]
 
 
 def applied_flow(command: Any, dead_zone: Any, u_min: Any, u_max: Any) -> Array:
-    """Return the flow u_a that the actuator applies for a command, (29), all in t/h.
+    """Return the flow u_a that the actuator applies, t/h: equation (29) of the paper.
 
-    A command inside the dead zone has no effect, and any other is limited. Arguments broadcast.
+    A command inside the dead zone gives a flow of 0, and any other command is limited. All
+    arguments broadcast against each other, and the flow has the resulting shape.
+
+    Parameters
+    ----------
+    command
+        The command u, t/h.
+    dead_zone
+        Half width of the dead zone, t/h. A command on the edge of the dead zone passes.
+    u_min, u_max
+        Lower and upper limit of the flow, t/h.
     """
     return np.where(np.abs(command) < dead_zone, 0.0, np.clip(command, u_min, u_max))
 
 
 def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
-    """Scale commands (t/h) to normalised float32 actions: -1 at `u_min` and 1 at `u_max`.
+    """Scale commands to normalised float32 actions: -1 at `u_min` and 1 at `u_max`.
 
-    Rounding can move a command from the edge of the dead zone to its inside, where it has no
-    effect. Such an action is moved outwards by one float. Arguments broadcast.
+    Rounding to float32 can move a command from the edge of the dead zone to the inside of the
+    dead zone, where a command has no effect. An action that was moved inside by rounding is
+    moved outwards by one float32 step. All arguments broadcast against each other, and the
+    actions have the resulting shape.
+
+    Parameters
+    ----------
+    command
+        The command u, t/h.
+    u_min, u_max
+        Lower and upper limit of the flow, t/h.
+    dead_zone
+        Half width of the dead zone, t/h; 0 to leave all actions as they are rounded.
     """
     action = np.asarray(2.0 * (command - u_min) / (u_max - u_min) - 1.0, dtype=np.float32)
     if np.ndim(dead_zone) == 0 and dead_zone <= 0.0:
@@ -39,7 +60,17 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
     """Move commands inside the dead zone to its edge or to 0, whichever is nearer.
 
-    `edge` is the half width of the dead zone, t/h. `xp` is the array module, NumPy or PyTorch.
+    The moved commands are returned, and a command outside the dead zone stays as it is.
+
+    Parameters
+    ----------
+    command
+        Commands in any unit of flow; an array or a tensor of any shape.
+    edge
+        Half width of the dead zone in the unit of `command`; a number, or an array that
+        broadcasts against `command`.
+    xp
+        The array module of `command`: NumPy or PyTorch.
     """
     magnitude = abs(command)
     edge_or_0 = edge * xp.sign(command) * (magnitude >= edge / 2.0)

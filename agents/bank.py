@@ -1,10 +1,12 @@
 """Identify the delays and time constants of plants by a bank of models.
 
-All quantities are scaled, so that one bank serves any plant: flows by half the actuator's
-range, temperatures by the steady effect of such a flow in the step test (the *authority*), and
-times by the sampling interval. A positive flow raises the temperature.
+All quantities are scaled, so that a bank suits any plant. Flows are divided by half the
+actuator's range. The *authority* is the steady change of temperature that half the actuator's
+range causes in the step test; temperatures are divided by the authority. Times are divided by
+the sampling interval. In scaled quantities, a positive flow raises the temperature.
 
-Arrays end with the plant: shapes are (n,), (time constants, n) and (delays, time constants, n).
+The last axis of every array is the plant: shapes are (n,), (time constants, n) and (delays,
+time constants, n), for n plants.
 """
 
 from __future__ import annotations
@@ -18,65 +20,90 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]
 
-# The shape of the plant (28), of which the bank varies gain, delay and time constant.
-FAST_POLE: Final = -0.4997  # the root of A that is not the time constant's
-NEWER_SHARE: Final = 0.9186  # share of the newer flow in the sum of B's coefficients
-NOISE_COLOUR: Final = (-0.3574, -0.03392)  # coefficients of C from z^-1 on
+# The paper's plant is equation (28), A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k).
+# All models of the bank have the following numbers, but differ in gain, delay, time constant.
+FAST_POLE: Final = -0.4997  # the faster of the two poles, the roots of the polynomial A
+NEWER_SHARE: Final = 0.9186  # first coefficient of the polynomial B divided by the sum of both
+NOISE_COLOUR: Final = (-0.3574, -0.03392)  # coefficients of the polynomial C from z^-1 on
 
-# Settings of the identification, chosen by the error on plants that vary.
-GAIN_MEMORY: Final = 0.999  # factor a sample: a gain that drifts is another after 1,000 samples
-MODEL_MEMORY: Final = 0.9995  # the same of the likelihoods: a delay does not drift
-CAUTION: Final = 0.5  # factor of the log-likelihoods, as the errors are not quite white
-LOAD_POLE: Final = 0.98  # zero of the whitening filter; the nearer 1, the less a load misleads
-FIRST_NOISE: Final = 0.07  # of the authority, standard deviation expected of one-step errors
-FIRST_NOISE_SAMPLES: Final = 30.0  # weight of this expectation, in samples
+# Settings of the identification, with which the control error was smallest on random plants.
+# Forgetting factor of the gains, per sample: a gain can drift within 1,000 samples.
+GAIN_MEMORY: Final = 0.999
+# Forgetting factor of the log-likelihoods, per sample: nearer to 1, as a delay does not drift.
+MODEL_MEMORY: Final = 0.9995
+# Factor of the log-likelihoods. It is below 1, as one-step errors are slightly correlated.
+CAUTION: Final = 0.5
+# Zero of the whitening filter. Nearer to 1, a load disturbs the estimates of gains less.
+LOAD_POLE: Final = 0.98
+# Standard deviation of the one-step errors that is expected at first, of the authority.
+FIRST_NOISE: Final = 0.07
+FIRST_NOISE_SAMPLES: Final = 30.0  # number of samples that `FIRST_NOISE` counts for
 NOISE_RATE: Final = 0.004  # least weight of the newest squared error in the noise variance
-LEAST_NOISE: Final = 0.003  # of the authority; smaller errors come from the models' low order
-OUTLIER: Final = 16.0  # multiple of the variance above which a squared error counts no more
+# Least standard deviation of the noise, of the authority. Smaller errors of the models would
+# come from their low order and not from noise.
+LEAST_NOISE: Final = 0.003
+# A squared error is limited to this multiple of the variance, so that an outlier counts little.
+OUTLIER: Final = 16.0
 GAINS: Final = (0.3, 3.0)  # least and greatest gain, as multiples of the step test's
-UNLIKELY: Final = -30.0  # logarithm of a probability that is as good as 0
-DESIGN_INTERVAL: Final = 2  # samples between new weights of the models, which cost most
-LAGS: Final = 4  # latest residuals that are known
+# Least logarithm of a probability, relative to the most probable model: exp(-30) is nearly 0.
+UNLIKELY: Final = -30.0
+# Samples between updates of the models' probabilities, which take the most computing time.
+DESIGN_INTERVAL: Final = 2
+LAGS: Final = 4  # number of latest outputs and of latest mean model outputs that a bank keeps
 
 
 @dataclass(frozen=True)
 class Prior:
-    """The prior knowledge of n plants, before they are controlled."""
+    """What is known of n plants before they are controlled: the models and their probabilities.
+
+    Each plant has a model for every pair of a delay and a time constant.
+    """
 
     time_constants: ArrayLike
     """Time constants of the models, samples, shape (time constants, n)."""
     shortest_delays: ArrayLike
-    """Shortest delay d of (28), samples, shape (n,). The models have this delay and the next
-    longer ones, a sample apart."""
+    """Shortest delay of each plant's models, samples, as the delay d of equation (28) of the
+    paper, shape (n,). The other delays of the models are 1, 2, ... samples longer."""
     log_probabilities: ArrayLike
-    """Logarithms of the models' probabilities, up to a constant, shape (delays, time
-    constants, n)."""
+    """Logarithms of the models' prior probabilities, up to a constant for each plant, shape
+    (delays, time constants, n)."""
     gain_spread: ArrayLike
-    """Standard deviation of the gain, as a share of the step test's, shape (n,)."""
+    """Standard deviation of the plant's gain before the first sample, as a share of the step
+    test's gain, shape (n,)."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimates of a bank for n plants: means over its models, and standard deviations."""
+    """The estimates of a bank for n plants: means and standard deviations over its models.
+
+    All means are weighted by the probabilities of the models.
+    """
 
     shares: Array
     """Probabilities of the time constants, shape (time constants, n)."""
     delay: Array
-    """Delay d of (28), samples."""
+    """Mean delay, samples, as the delay d of equation (28) of the paper, shape (n,)."""
     delay_spread: Array
+    """Standard deviation of the delay, samples, shape (n,)."""
     log_constant: Array
-    """Natural logarithm of the time constant in samples."""
+    """Mean natural logarithm of the time constant in samples, shape (n,)."""
     constant_spread: Array
+    """Standard deviation of the natural logarithm of the time constant, shape (n,)."""
     pole: Array
-    """Pole of the mean model that belongs to its time constant."""
+    """Mean of exp(-1 / T), the pole of a model with the time constant T in samples, shape
+    (n,)."""
     fading: Array
-    """Share of a slow deviation that remains when the next flow shows, d + 1 samples later."""
+    """Mean of exp(-(d + 1) / T), shape (n,): the share of a deviation that remains after d + 1
+    samples, when the present flow shows in the output, if it decays with the time constant T
+    in samples."""
 
 
 def second_order(time_constants: Array) -> tuple[Array, Array, Array, Array]:
     """Return a1, a2, b1 and b2 of s(k) = a1 s(k-1) + a2 s(k-2) + b1 f(k-1) + b2 f(k-2).
 
-    The model has a gain of 1, the given time constants in samples, and the shape of (28).
+    The equation is a model with the flow f as its input, the output s, a gain of 1 and no
+    delay. Its fast pole, and the ratio b1 / b2, are those of equation (28) of the paper.
+    `time_constants` are in samples, and the four arrays have the same shape.
     """
     pole = np.exp(-1.0 / time_constants)
     total = (1.0 - pole) * (1.0 - FAST_POLE)
@@ -85,7 +112,15 @@ def second_order(time_constants: Array) -> tuple[Array, Array, Array, Array]:
 
 
 class Whitening:
-    """Filter that makes the noise of (28) white: (1 - FAST_POLE/z) (1 - LOAD_POLE/z) / C."""
+    """The filter (1 - FAST_POLE/z) (1 - LOAD_POLE/z) / C(1/z), which makes noise nearly white.
+
+    The noise is that of equation (28) of the paper, C xi / A, with the polynomials A and C.
+
+    Parameters
+    ----------
+    shape
+        Shape of a sample of the signal; every element is filtered by itself, from rest.
+    """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         rest = np.zeros(shape, np.float32)
@@ -93,7 +128,7 @@ class Whitening:
         self._outputs = deque([rest, rest], maxlen=2)
 
     def __call__(self, signal: Array) -> Array:
-        """Return the next sample of the filtered signal."""
+        """Return the next sample of the filtered signal, for the next sample of the signal."""
         output: Array = signal - (FAST_POLE + LOAD_POLE) * self._inputs[0]
         output = output + FAST_POLE * LOAD_POLE * self._inputs[1]
         for coefficient, earlier in zip(NOISE_COLOUR, self._outputs, strict=True):
@@ -106,25 +141,36 @@ class Whitening:
 class Bank:
     """Models of n plants, y(k) = g s(k - d), one for each pair of a delay and time constant.
 
-    s is the response of the model with gain 1 and no delay to the flow. The gain g of each
-    model is estimated by recursive least squares on whitened signals. The step test's gain is a
-    prior that is never forgotten. The probability of a model follows from its one-step errors,
-    as for a Gaussian density. Both forget exponentially.
+    Here y is the output, d the delay in samples, and s the output of a model with gain 1 and no
+    delay for the flows so far. The gain g of each model is estimated by recursive least squares
+    on whitened signals. The step test's gain is a prior, which is never forgotten. The
+    probability of a model follows from its one-step errors, which are taken for Gaussian. The
+    estimates of gains and the probabilities forget old samples exponentially.
 
-    At each sample, `observe` the output, then `apply` the flow. In between, `estimate`,
-    `noise`, `innovation`, `outputs` and `responses` tell what is known.
+    At each sample, call `observe` with the output, read the attributes, choose a flow, and call
+    `apply` with the flow.
+
+    Parameters
+    ----------
+    prior
+        The models, and what is known of the plants before the first sample.
 
     Attributes
     ----------
+    n : int
+        The number of plants.
+    time_constants, gain_spread : ndarray
+        The fields of `prior`, as arrays of float32.
     estimate : Estimate
-        Means over the models; renewed at every second sample.
-    noise : ndarray
-        Standard deviation of the one-step errors, of the authority.
+        Means and standard deviations over the models, renewed at every second sample.
     innovation : ndarray
-        The newest one-step error.
-    outputs, responses : ndarray
-        The latest outputs, and the responses s of the mean model at the same samples, newest
-        first, shape (LAGS, n).
+        The newest one-step error of the whitened output, mean over the models, of the
+        authority, shape (n,).
+    outputs : ndarray
+        The latest outputs y(k), y(k-1), ..., of the authority, shape (LAGS, n).
+    responses : ndarray
+        The mean of s(k - d) over the models, then the means of s(k - d - 1), ..., shape
+        (LAGS, n).
     """
 
     def __init__(self, prior: Prior) -> None:
@@ -144,9 +190,12 @@ class Bank:
         self._coefficients = second_order(self.time_constants)
 
         def zeros(*shape: int) -> Array:
+            """Return zeros of this shape in float32."""
             return np.zeros(shape, np.float32)
 
-        # The responses s, plain and whitened, of the last samples, without and with the delays.
+        # Outputs s of the models with gain 1. `_response` has the last two samples of s without
+        # delay, and `_undelayed` s and the whitened s of past samples, in a ring. `_delayed`
+        # has s(k - d), newest first, and `_regressors` the whitened s(k - d) of each model.
         self._response = deque(zeros(2, constants, self.n), maxlen=2)
         self._flow = zeros(self.n)
         self._undelayed = zeros(int(self._shortest.max()) + 1, 2, constants, self.n)
@@ -156,7 +205,7 @@ class Bank:
         self._whiten_response = Whitening((constants, self.n))
         self.outputs = zeros(LAGS, self.n)
         self.responses = zeros(LAGS, self.n)
-        # Sums over the past with forgetting.
+        # Sums over past samples, in which old samples are forgotten exponentially.
         self._information, self._products = zeros(*models), zeros(*models)
         self._log_likelihoods = zeros(*models)
         self._variance = zeros(self.n) + FIRST_NOISE**2
@@ -177,7 +226,7 @@ class Bank:
         return deviations
 
     def observe(self, output: Array) -> None:
-        """Learn from the output y(k), shape (n,)."""
+        """Update the models with the newest output y(k), of the authority, shape (n,)."""
         self.outputs[1:] = self.outputs[:-1]
         self.outputs[0] = output
         rows = (self._k - self._shortest) % len(self._undelayed)
@@ -197,7 +246,10 @@ class Bank:
         )
 
     def apply(self, flow: Array) -> None:
-        """Take note of the flow f(k) that the plants receive, shape (n,)."""
+        """Update the models with the flow f(k) that the actuator passes, shape (n,).
+
+        The flow is scaled by half the actuator's range. `apply` follows `observe` in a sample.
+        """
         a1, a2, newer, older = self._coefficients
         response = a1 * self._response[0] + a2 * self._response[1]
         response = response + newer * flow + older * self._flow
@@ -208,7 +260,10 @@ class Bank:
         self._undelayed[row, 1] = self._whiten_response(response)
 
     def _learn(self, whitened: Array) -> None:
-        """Update sums and likelihoods by the newest whitened output."""
+        """Update gains' sums, noise variance and log-likelihoods; called by `observe`.
+
+        `whitened` is the newest output after the whitening filter, shape (n,).
+        """
         regressors = self._regressors
         errors = whitened - self._gains * regressors
         self.innovation = np.einsum("dtn,dtn->n", self._weights, errors)
@@ -227,7 +282,7 @@ class Bank:
         self._products += regressors * whitened
 
     def _design(self) -> None:
-        """Renew gains and probabilities of the models, and the means over them."""
+        """Compute the gains and probabilities of the models, and `estimate`, from the sums."""
         prior = self._variance / self._gain_variance
         information = self._information + prior
         self._gains = np.clip((self._products + prior) / information, *GAINS)
@@ -250,7 +305,11 @@ class Bank:
 
 
 def _moments(weights: Array, values: Array) -> tuple[Array, Array]:
-    """Return mean and standard deviation of values over the first axis."""
+    """Return the weighted mean and standard deviation of `values` over the first axis.
+
+    `weights` are probabilities, whose sum over the first axis is 1. Both arguments have the
+    shape (count, n), and both results the shape (n,).
+    """
     mean = (weights * values).sum(0)
     variance = (weights * np.square(values - mean)).sum(0)
     return mean, np.sqrt(variance)

@@ -15,87 +15,98 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.actuator import float32_action
 
-PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}  # the paper's six inputs
+# Arguments of the environment that show the six inputs of the paper's network: the latest three
+# set points and the latest three errors.
+PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
-MOST = 1_000_000  # nodes, loops, elements or samples; a larger number is a mistake
+# Largest number of nodes, loops, array elements or samples of delay that is accepted. A larger
+# argument is a typing error, and could exhaust the memory.
+MOST = 1_000_000
 
 Validator = Callable[[str, Any], Any]
 
 
 def _reject(name: str, value: Any, allowed: str) -> NoReturn:
-    """Raise a ValueError that says what an argument must be and what it is."""
+    """Raise a ValueError that says what the argument `name` must be, and its `value`.
+
+    `allowed` describes the allowed values in words, such as "a finite number".
+    """
     raise ValueError(f"{name} must be {allowed}, got {value!r}")
 
 
 def _is_real(value: Any) -> bool:
+    """Return whether a value is a real number, NaN and infinity included, but not a bool."""
     return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
 
 
 def _is_integer(value: Any) -> bool:
+    """Return whether a value is an integer of Python or NumPy, but not a bool."""
     return isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
 
 
-# Validators of arguments. They return a plain float, int or bool if the value is allowed, and
-# raise a ValueError that names the argument otherwise.
+# The following functions validate an argument: `name` is the argument's name, for the message.
+# An allowed value is returned as a Python float, int or bool. For any other value, the function
+# raises a ValueError that names the argument.
 
 
 def finite(name: str, value: Any) -> float:
-    """Check that a value is a finite number."""
+    """Return the argument `value` as a float; raise a ValueError unless it is finite."""
     if not (_is_real(value) and math.isfinite(value)):
         _reject(name, value, "a finite number")
     return float(value)
 
 
 def not_negative(name: str, value: Any) -> float:
-    """Check that a value is a finite number of at least 0."""
+    """Return `value` as a float; raise a ValueError unless it is finite and at least 0."""
     if not (_is_real(value) and 0.0 <= value < math.inf):
         _reject(name, value, "a finite number of at least 0")
     return float(value)
 
 
 def positive(name: str, value: Any) -> float:
-    """Check that a value is a finite number above 0."""
+    """Return `value` as a float; raise a ValueError unless it is finite and above 0."""
     if not (_is_real(value) and 0.0 < value < math.inf):
         _reject(name, value, "a finite number above 0")
     return float(value)
 
 
 def nonzero(name: str, value: Any) -> float:
-    """Check that a value is a finite number other than 0."""
+    """Return `value` as a float; raise a ValueError unless it is finite and not 0."""
     if not (_is_real(value) and 0.0 < abs(value) < math.inf):
         _reject(name, value, "a finite number other than 0")
     return float(value)
 
 
 def flag(name: str, value: Any) -> bool:
-    """Check that a value is True or False."""
+    """Return `value` as a bool; raise a ValueError unless it is True or False."""
     if not isinstance(value, bool | np.bool_):
         _reject(name, value, "True or False")
     return bool(value)
 
 
 def integer_from_0(name: str, value: Any) -> int:
-    """Check that a value is an integer of at least 0."""
+    """Return `value` as an int; raise a ValueError unless it is an integer of at least 0."""
     if not (_is_integer(value) and value >= 0):
         _reject(name, value, "an integer of at least 0")
     return int(value)
 
 
 def integer_from_1(name: str, value: Any) -> int:
-    """Check that a value is an integer of at least 1."""
+    """Return `value` as an int; raise a ValueError unless it is an integer of at least 1."""
     if not (_is_integer(value) and value >= 1):
         _reject(name, value, "an integer of at least 1")
     return int(value)
 
 
 def integer_to_most(name: str, value: Any) -> int:
-    """Check that a value is an integer from 1 to `MOST`."""
+    """Return `value` as an int; raise a ValueError unless it is an integer from 1 to `MOST`."""
     if not (_is_integer(value) and 1 <= value <= MOST):
         _reject(name, value, f"an integer from 1 to {MOST:,}")
     return int(value)
 
 
-# Types for the fields of controllers, each with its validator, which the constructor applies.
+# Types for the fields of controllers. Each type carries one of the validators above, which the
+# controller's constructor calls.
 Number = Annotated[float, finite]
 NotNegative = Annotated[float, not_negative]
 Positive = Annotated[float, positive]
@@ -107,16 +118,32 @@ Size = Annotated[int, integer_to_most]
 
 
 def check(name: str, value: Any, annotation: Any) -> Any:
-    """Return a value that the validator of a type such as `Positive` accepts.
+    """Return a value as the validator of an annotated type converts it.
 
-    A ValueError is raised if it does not.
+    Parameters
+    ----------
+    name
+        Name of the argument, for the message of an error.
+    value
+        The value to check.
+    annotation
+        A type with a validator, such as `Positive`.
+
+    Raises
+    ------
+    ValueError
+        If the validator rejects the value.
     """
     (validator,) = annotation.__metadata__
     return validator(name, value)
 
 
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return real numbers as a float64 array; raise a ValueError for anything else."""
+    """Return real numbers as a float64 array of the same shape.
+
+    `name` is the argument's name for the message of the ValueError, which is raised if `value`
+    is not an array-like of real numbers: text, complex numbers or rows of unequal length.
+    """
     try:
         array = np.asarray(value)
         if array.dtype.kind in "biufO":  # neither text, which NumPy would parse, nor complex
@@ -128,7 +155,10 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 @cache  # as reading the annotations is slow
 def _validated_fields(controller: type) -> dict[str, Any]:
-    """Return the annotations of a controller's fields that have a validator, by name."""
+    """Return the types of those fields of a controller class that carry a validator.
+
+    The keys are the names of the fields, and a value is a type such as `Positive`.
+    """
     annotations = get_type_hints(controller, include_extras=True)
     return {
         name: annotation
@@ -139,30 +169,31 @@ def _validated_fields(controller: type) -> dict[str, Any]:
 
 @dataclass(eq=False, kw_only=True)
 class Controller(ABC):
-    """A controller of one loop, or of a batch of independent loops.
+    """A controller of one control loop, or of a batch of independent control loops.
 
-    Controllers are dataclasses: their fields are the arguments of the constructor, and types
-    such as `Positive` state which values are allowed.
+    Controllers are dataclasses: the fields of a controller are the arguments of its
+    constructor, and the type of a field, such as `Positive`, states which values are allowed.
 
     Parameters
     ----------
     u_min
-        Lower limit of the actuator, t/h. The limits are the flows for which the actions -1 and
-        1 stand. The controller does not clip commands beyond the limits.
+        Lower limit of the actuator, t/h: the flow for which the action -1 stands. Commands
+        beyond the limits of the actuator are not clipped by the controller.
     u_max
-        Upper limit of the actuator, t/h.
+        Upper limit of the actuator, t/h: the flow for which the action 1 stands.
 
     Attributes
     ----------
     n_obs : int
-        The minimum number of elements in an observation.
+        The minimum number of elements in an observation of one loop.
     command : float64 or ndarray of float64
-        The last command u, before the actuator, t/h; after `act` on a batch, shape (batch,).
+        The last command u, t/h: the flow that the controller asked of the actuator. After `act`
+        on a batch of loops, the shape is (batch,).
 
     Raises
     ------
     ValueError
-        If an argument is out of range; the message names it.
+        If an argument is out of range; the message names the argument.
     """
 
     u_min: Number = -10.0
@@ -170,13 +201,19 @@ class Controller(ABC):
     n_obs: int = field(init=False, repr=False)
     command: Values = field(init=False, repr=False)
 
-    # Half width of the dead zone, t/h: commands on its edge keep their effect as actions.
+    # Half width of the actuator's dead zone, t/h, if the controller commands its edge: an
+    # action for the edge is rounded such that the flow passes the dead zone.
     _edge = 0.0
-    # Whether the controller remembers past samples. If not, the batch size may always change.
+    # Whether the controller remembers past samples. A controller without memory may get another
+    # batch size at any sample.
     _remembers = True
 
     def __post_init__(self) -> None:
-        """Check the arguments and reset. Subclasses add what `reset` does not need."""
+        """Check the constructor's arguments, and call `reset`.
+
+        A subclass calls this method first, and then sets the attributes that its `reset` does
+        not use.
+        """
         for name, annotation in _validated_fields(type(self)).items():
             setattr(self, name, check(name, getattr(self, name), annotation))
         if self.u_min >= self.u_max:
@@ -184,7 +221,7 @@ class Controller(ABC):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the episode, but keep what was learnt."""
+        """Forget the past samples before a new episode, but keep learnt weights."""
         self.command = np.float64(0.0)
         # Shape of the loops since `reset`, () or (batch,); None before the first sample.
         self._loops_before: tuple[int, ...] | None = None
@@ -192,22 +229,27 @@ class Controller(ABC):
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the controller was not made for, as their scores would be wrong.
 
+        `mptc_gym.evaluate` calls this method before it runs the controller.
+
         Parameters
         ----------
         parameters
             The arguments of the plants, as attributes with the names of `mptc_gym.Parameters`;
-            arrays if they differ between plants.
+            an argument that differs between plants is an array of shape (n,).
         wrapped
-            The names of wrappers that change observations or actions; "" without any.
+            The names of the environment's wrappers that change observations or actions; ""
+            without such wrappers.
         n
-            Number of plants.
+            Number of plants, each of which is one loop.
 
         Raises
         ------
         ValueError
-            If limits, places in the observation, wrappers or the number of loops do not fit.
+            If the limits of the flow differ, if the controller would read a set point or an
+            error at the wrong place of the observation, if the environment is wrapped, or if
+            the controller has weights for another number of loops.
         """
-        # Where limits are drawn, the controller has the widest.
+        # If each episode draws its limits of the flow, the controller must have the widest.
         limits = float(np.min(parameters.u_min)), float(np.max(parameters.u_max))
         if limits != (self.u_min, self.u_max):
             raise ValueError(
@@ -232,25 +274,26 @@ class Controller(ABC):
             )
 
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """Return the action for an observation.
+        """Return the action of the present sample; call this method once for each sample.
 
         Parameters
         ----------
         observation
-            Shape (n_obs,), or (batch, n_obs) with one row per loop. Elements beyond those
-            that the controller reads are ignored.
+            The environment's observation, of shape (n_obs,) for one loop, or (batch, n_obs)
+            with one row per loop. Elements that the controller does not read are ignored.
 
         Returns
         -------
         ndarray of float32
-            The normalised action, shape (1,) or (batch, 1), with the dtype of the action space.
-            It lies outside [-1, 1] where the command exceeds the actuator's limits.
+            The normalised action: -1 stands for `u_min`, and 1 for `u_max`. The shape is (1,)
+            for one loop, or (batch, 1). An action lies outside [-1, 1] if the command exceeds
+            the actuator's limits.
 
         Raises
         ------
         ValueError
-            If the observation has the wrong shape, a value that is not finite, or a batch size
-            that differs from the one since `reset`. The controller is then unchanged.
+            If the observation has the wrong shape, a value that is not finite, or another batch
+            size than the observations since `reset`. The error leaves the controller unchanged.
         """
         values = check_numbers("observation", observation)
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs or not len(values):
@@ -274,14 +317,19 @@ class Controller(ABC):
 
     @abstractmethod
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return u, t/h, shape (loops,), for checked observations, shape (loops, size)."""
+        """Return the commands u(k), t/h, shape (loops,), and update the controller's memory.
+
+        `act` calls this method once per sample. `rows` are the checked observations, with one
+        row per loop, shape (loops, size).
+        """
 
 
 @dataclass(eq=False, kw_only=True)
 class ModelBasedController(Controller):
-    """A controller that knows the results of a step test and the actuator's numbers.
+    """A controller that knows a step test of the plant, and the numbers of the actuator.
 
-    The limits are those of `Controller`.
+    The step test gives the gain, the time constant and the delay of a first-order model. The
+    arguments `u_min` and `u_max` are those of `Controller`.
 
     Parameters
     ----------
@@ -290,10 +338,11 @@ class ModelBasedController(Controller):
     time_constant
         Time constant of the plant, s.
     delay
-        Delay of the plant, s, including the one sample that any input takes to show.
+        Delay of the plant, s, from a change of the command to the first change of a sampled
+        output: d + 1 sampling intervals for a transport delay of d samples.
     dead_zone
-        Half width of the actuator's dead zone, t/h; 0 if unknown. Commands inside it reach the
-        plant as 0; those on its edge have an effect.
+        Half width of the actuator's dead zone, t/h; 0 if unknown. A command inside the dead
+        zone reaches the plant as a flow of 0; a command on the edge of the dead zone passes.
     sampling_interval
         Sampling interval, s.
     """

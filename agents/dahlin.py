@@ -1,4 +1,4 @@
-"""Implement Dahlin's controller: internal model control with a first-order response."""
+"""Implement Dahlin's controller: the closed loop follows set points like a first-order lag."""
 
 from __future__ import annotations
 
@@ -19,35 +19,37 @@ Array = NDArray[np.float64]
 class DahlinController(InternalModelController):
     """A controller that makes the output approach the set point like a first-order lag.
 
-    E. B. Dahlin, "Designing and tuning digital controllers", Instruments and Control Systems
-    41 (6), 1968, 77-83. It is written here as internal model control (M. Morari and E.
-    Zafiriou, "Robust Process Control", 1989, chapter 3), with g = 1 - exp(-h / lambda) and
-    f = 1 - exp(-h / T_f) for the sampling interval h:
+    The controller is that of E. B. Dahlin, "Designing and tuning digital controllers",
+    Instruments and Control Systems 41 (6), 1968, 77-83, written as internal model control (M.
+    Morari and E. Zafiriou, "Robust Process Control", 1989, chapter 3). Let h be the sampling
+    interval, g = 1 - exp(-h / lambda) and f = 1 - exp(-h / T_f):
 
-    - A model of first order, x(k+1) = p x(k) + b u_a(k), runs beside the plant; x(k-d) is what
-      the plant should show now.
-    - D is the estimated disturbance: the measured output less the output of the model, after a
-      low-pass filter: D(k) = D(k-1) + f (y(k) - x(k-d) - D(k-1)).
-    - The command is the one that moves the model a share g of its way to y_d - D:
-      u(k) = ((1 - p) x(k) + g (y_d(k) - D(k) - x(k))) / b.
+    - A first-order model, x(k+1) = p x(k) + b u_a(k), runs in parallel with the plant, where
+      u_a is the flow that the actuator passes. With the delay of d samples, the model predicts
+      that the plant's output y(k) is x(k-d).
+    - The estimated disturbance D(k), degC, is the measured output minus the model's output,
+      after a low-pass filter: D(k) = D(k-1) + f (y(k) - x(k-d) - D(k-1)).
+    - The command u(k) moves the model's state x a share g of its way to y_d - D, the set point
+      minus the disturbance: u(k) = ((1 - p) x(k) + g (y_d(k) - D(k) - x(k))) / b.
 
-    A command inside the dead zone is moved to 0 or to the edge of the zone, whichever is
-    nearer. There is no integral: the model has the flow u_a that the actuator passes, so that
-    nothing winds up.
+    A command inside the dead zone is moved to 0 or to the edge of the dead zone, whichever is
+    nearer. The controller needs no anti-windup: it has no integral, and the model's input is
+    the flow u_a that the actuator passes.
 
     The other parameters are those of `ModelBasedController`.
 
     Parameters
     ----------
     closed_loop_time_constant
-        lambda, time constant of the response to the set point, s. With a large lambda, the
-        commands for small errors stay inside the dead zone and have no effect. The controller
-        then does not correct errors up to 0.5 |gain| dead_zone lambda / time_constant, degC.
+        lambda, time constant of the response to a step of the set point, s. With a large
+        lambda, the commands for small errors stay inside the dead zone and have no effect. Then
+        errors up to 0.5 |gain| dead_zone lambda / time_constant, degC, are not corrected.
     filter_time_constant
-        T_f, time constant of the filter of the disturbance, s. It sets the robustness of the
-        loop without changing the response to the set point; 0 for no filter, as in 1968.
+        T_f, time constant of the low-pass filter of the disturbance, s; 0 for no filter, as in
+        Dahlin's paper. A larger T_f makes the loop more robust, and does not change the
+        response to the set point if the model is right.
     setpoint_index, error_index
-        Indices of y_d(k) and e(k), degC, in the observation.
+        Indices of the set point y_d(k) and of the error e(k), both in degC, in the observation.
     """
 
     closed_loop_time_constant: Positive
@@ -64,15 +66,20 @@ class DahlinController(InternalModelController):
             self._filter = -math.expm1(-self.sampling_interval / self.filter_time_constant)
 
     def reset(self) -> None:
-        """Return the model and the estimate of the disturbance to rest."""
+        """Set the model's outputs and the estimated disturbance to 0, before a new episode."""
         super().reset()
         self._disturbance: Values = np.float64(0.0)  # D, degC
 
     def transfer(self) -> tuple[Array, Array]:
-        """Return the transfer function from -y to u, valid away from limits and dead zone.
+        """Return the transfer function from -y to the command u, t/h per degC.
 
-        The set point is 0, where -y is the error. The coefficients are those of
-        `PIController.transfer`.
+        The set point is 0, so the error is -y, the negative output. The controller is linear
+        while the command is between the limits of the flow and outside the dead zone.
+
+        Returns
+        -------
+        numerator, denominator
+            Coefficients of z^0, z^-1 and so on.
         """
         share = self._approach * self._filter
         numerator = share * np.array([1.0, -self._pole])
@@ -82,6 +89,10 @@ class DahlinController(InternalModelController):
         return numerator, self._input_gain * polysub(smoothed, in_transit)
 
     def _control(self, rows: Array) -> Array:
+        """Return the commands u(k), t/h, shape (loops,), and advance the model by a sample.
+
+        `rows` are the observations, shape (loops, size).
+        """
         setpoint = rows[:, self.setpoint_index]
         output = setpoint - rows[:, self.error_index]
         residual = output - self._delayed

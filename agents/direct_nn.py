@@ -1,4 +1,4 @@
-"""Implement the paper's neural controller, trained online from the plant's output error."""
+"""Implement the paper's neural controller, which learns online from the control error."""
 
 from __future__ import annotations
 
@@ -26,24 +26,31 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)  # arrays have no single truth value
 class Weights:
-    """Weights and thresholds of one network, or of many along a leading batch axis."""
+    """Weights and thresholds of one network, or of a batch of networks.
+
+    A network has N inputs, N_1 hidden nodes and one output. The arrays of a batch have a
+    leading batch axis in addition to the shapes below.
+    """
 
     W: Array
-    """W_ij, from input i to hidden node j; shape (N_1, N)."""
+    """Weights W_ij from input i to hidden node j; shape (N_1, N)."""
     theta_1: Array
-    """theta_1j, thresholds of the hidden nodes; shape (N_1,)."""
+    """Thresholds theta_1j of the hidden nodes; shape (N_1,)."""
     W_1: Array
-    """W_1j1, from hidden node j to the output; shape (N_1,)."""
+    """Weights W_1j1 from hidden node j to the output; shape (N_1,)."""
     theta_2: Array
-    """theta_21, threshold of the output; shape ()."""
+    """Threshold theta_21 of the output; shape ()."""
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the weights to a `.npz` file."""
+        """Write the weights to the `.npz` file `path`, which `load` reads."""
         write(path, {}, **vars(self))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Weights:
-        """Read weights written by `save`; errors are those of `agents.networks.reading`."""
+        """Return the weights in a file that was written by `save`.
+
+        A ValueError is raised if the file is damaged or holds something else.
+        """
         with reading(path, "weights") as file:
             return cls(**{field.name: file[field.name] for field in fields(cls)})
 
@@ -52,16 +59,17 @@ class Weights:
 class DirectNNController(Controller):
     """A network of N inputs, N_1 hidden nodes and one output that learns while it controls.
 
-    It implements steps A to E of Section 4 of the paper: the forward pass with the weights of
-    sample k, then their update from e(k) and the activations of that pass. All it knows of the
-    plant is the direction D(G) of its response.
+    At each sample k, the controller takes steps A to E of Section 4 of the paper: the command
+    is computed with the present weights, and then the weights are updated from the error e(k)
+    and the activations of the nodes. The only knowledge about the plant is D(G), the direction
+    in which the output moves when the input rises.
 
     Parameters
     ----------
     u_min
-        U_min, the lowest command, t/h.
+        U_min, the lowest command, t/h: an output of 0 of the network.
     u_max
-        U_max, the highest command, t/h.
+        U_max, the highest command, t/h: an output of 1 of the network.
     n_inputs
         N, number of inputs, which are the first N elements of the observation.
     n_hidden
@@ -75,24 +83,27 @@ class DirectNNController(Controller):
     eta_1_theta
         eta_1theta^y, learning rate of theta_2, the threshold of the output.
     direction
-        D(G): -1 for a plant whose output falls when its input rises, 1 for the opposite.
+        D(G): -1 for a plant whose output falls when its input rises, 1 for a plant whose output
+        rises with its input.
     input_scale
-        Factor from the observation (degC) to the inputs X_i. The paper does not state one.
+        Factor from elements of the observation, degC, to the inputs X_i of the network. The
+        paper does not state this factor.
     weight_scale
-        Initial weights and thresholds are drawn uniformly from [-weight_scale, weight_scale].
-        The paper says "selected randomly".
+        Initial weights and thresholds are random numbers, uniformly distributed in
+        [-weight_scale, weight_scale]. The paper only says "selected randomly".
     error_index
-        Index of e(k), degC, in the observation.
+        Index of the error e(k), degC, in the observation.
     seed
         Seed of the initial weights.
     num_envs
-        Number of loops in a batch, each with its own network; None for a single loop. Member i
-        equals a single controller with seed `seed + i`, bit for bit.
+        Number of loops in a batch, each with its own network; None for a single loop. The
+        network of loop i equals that of a single controller with the seed `seed + i`, bit for
+        bit.
     learning
-        Whether the weights are updated; it can be changed at any time.
+        Whether the weights are updated; this attribute can be changed at any time.
     update_interval
-        The weights are updated at every `update_interval`-th sample, starting with the first of
-        an episode.
+        The weights are updated at every `update_interval`-th sample, starting with the first
+        sample of an episode.
 
     Examples
     --------
@@ -107,7 +118,7 @@ class DirectNNController(Controller):
 
     n_inputs: Size = 6
     n_hidden: Size = 3
-    # The gain factors and scales are those of the search `benchmarks.tune nn` in version 0.1.
+    # The learning rates and scales are those of the search `benchmarks.tune nn` in version 0.1.
     eta: NotNegative = 5.3
     eta_1: NotNegative = 0.0303
     eta_theta: NotNegative = 0.0462
@@ -138,7 +149,7 @@ class DirectNNController(Controller):
         self.weights = self._initial_weights()
 
     def _initial_weights(self) -> Weights:
-        """Draw the weights of every network of the batch from its own seed."""
+        """Return random initial weights; network i of a batch uses the seed `seed + i`."""
         members = self.num_envs or 1
         generators = [np.random.default_rng(self.seed + i) for i in range(members)]
         arrays: dict[str, Array] = {}
@@ -150,19 +161,21 @@ class DirectNNController(Controller):
 
     @property
     def _batch_shape(self) -> tuple[int, ...]:
-        """The leading axis of weights and observations: () or (num_envs,)."""
+        """The leading axis of the weights of a batch: (num_envs,), or () without a batch."""
         return () if self.num_envs is None else (self.num_envs,)
 
     @property
     def weights(self) -> Weights:
-        """A copy of the current weights; with `num_envs`, each has a leading batch axis.
+        """A copy of the current weights; in a batch, each array has a leading batch axis.
 
-        Weights to set must have the same shapes; in a batch, one network's weights set all.
+        Weights that are assigned must have the shapes of the current weights. In a batch,
+        weights without a batch axis are assigned to all networks.
 
         Raises
         ------
         ValueError
-            If a shape does not fit or a value is not finite; the weights are then unchanged.
+            If an assigned array has a wrong shape or a value that is not finite. The error
+            leaves the weights unchanged.
         """
         arrays: dict[str, Array] = {}
         for name, stored in zip(self._shapes, self._arrays, strict=True):
@@ -172,6 +185,7 @@ class DirectNNController(Controller):
 
     @weights.setter
     def weights(self, weights: Weights) -> None:
+        """Replace the weights of all networks by copies of `weights`."""
         arrays = []
         for name, shape in self._shapes.items():
             array = check_array(
@@ -183,14 +197,16 @@ class DirectNNController(Controller):
             )
             batch = np.broadcast_to(array, (self.num_envs or 1, *shape))
             arrays.append(np.array(batch.T, order="C"))
-        # In the order of `Weights`. The batch axis is last, so that sums over nodes add long
-        # rows: W is stored as (N, N_1, batch).
+        # The arrays are stored in the order of the fields of `Weights`, and transposed: W has
+        # the shape (N, N_1, batch). With the batch axis last, sums over nodes add long rows,
+        # which is fast.
         self._arrays = arrays
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
-        """Refuse plants that the controller was not made for.
+        """Refuse plants that the controller was not made for, by a ValueError.
 
-        See `Controller`; here, `num_envs` must be the number of plants, too.
+        The arguments are those of `Controller.check_environment`. In addition to the checks of
+        `Controller`, `num_envs` must equal the number of plants, `n`.
         """
         super().check_environment(parameters, wrapped, n)
         if self.num_envs != n:
@@ -200,43 +216,48 @@ class DirectNNController(Controller):
             )
 
     def reset(self) -> None:
-        """Forget the episode, but keep the weights."""
+        """Begin a new episode, but keep the weights that were learnt."""
         super().reset()
         self._loops_before = self._batch_shape
         self._sample = 0  # k
 
     def _control(self, rows: Array) -> Array:
-        """Take steps A to E of Section 4: return u, then learn from e."""
+        """Return the commands u(k), t/h, shape (loops,), and update the weights.
+
+        The method takes steps A to E of Section 4 of the paper. `rows` are the observations,
+        shape (loops, size).
+        """
         X = self.input_scale * np.ascontiguousarray(rows[:, : self.n_inputs].T)  # (N, batch)
         e = rows[:, self.error_index]
 
         W, theta_1, W_1, theta_2 = self._arrays
-        X_1 = _sigmoid(_sum_of_rows(W * X[:, np.newaxis]) + theta_1)  # A
-        X_2 = _sigmoid(_sum_of_rows(W_1 * X_1) + theta_2)  # B
-        u = X_2 * (self.u_max - self.u_min) + self.u_min  # Section 4, last formula
+        X_1 = _sigmoid(_sum_of_rows(W * X[:, np.newaxis]) + theta_1)  # step A
+        X_2 = _sigmoid(_sum_of_rows(W_1 * X_1) + theta_2)  # step B
+        u = X_2 * (self.u_max - self.u_min) + self.u_min  # last formula of Section 4
 
         if self.learning and self._sample % self.update_interval == 0:
-            delta_1 = e * self.direction * X_2 * (1.0 - X_2)  # (27)
-            delta = delta_1 * W_1 * X_1 * (1.0 - X_1)  # D, with W_1(k): before C
-            W_1 += self.eta_1 * delta_1 * X_1  # C
-            W += self.eta * delta * X[:, np.newaxis]  # D
-            theta_2 += self.eta_1_theta * delta_1  # E
-            theta_1 += self.eta_theta * delta  # E
+            delta_1 = e * self.direction * X_2 * (1.0 - X_2)  # equation (27) of the paper
+            # The paper's delta uses the weights W_1(k), so it comes before their update.
+            delta = delta_1 * W_1 * X_1 * (1.0 - X_1)
+            W_1 += self.eta_1 * delta_1 * X_1  # step C
+            W += self.eta * delta * X[:, np.newaxis]  # step D
+            theta_2 += self.eta_1_theta * delta_1  # step E
+            theta_1 += self.eta_theta * delta  # step E
         self._sample += 1
         return u
 
 
 def _sum_of_rows(terms: Array) -> Array:
-    """Return the sum over the first axis, added one row after the other.
+    """Return the sum of `terms` over the first axis, added one row after the other.
 
-    The order in which np.sum adds can depend on the batch size, and then a batch would not
-    equal its single members bit for bit.
+    np.sum is not used, as the order of its additions can depend on the batch size. Then a
+    network in a batch would not equal a single network bit for bit.
     """
     total: Array = np.add.accumulate(terms, axis=0)[-1]
     return total
 
 
 def _sigmoid(x: Array) -> Array:
-    """Return 1 / (1 + exp(-x)), (4), without overflow."""
+    """Return 1 / (1 + exp(-x)), equation (4) of the paper, without an overflow of exp."""
     activation: Array = 1.0 / (1.0 + np.exp(np.minimum(-x, 700.0)))
     return activation

@@ -1,7 +1,8 @@
-"""Hedge set points that are known to change at random.
+"""Choose targets for the output where the set point is known to change at random.
 
-A flow shows only after the delay. If the set point may have changed by then, the output with
-the least expected error lies between the set point and the middle of its range.
+A change of the flow shows in the output only after the delay. If the set point may change
+within the delay, the output with the least expected error lies between the present set point
+and 0, the middle of the range of set points. Aiming at such an output is called *hedging*.
 """
 
 from __future__ import annotations
@@ -14,29 +15,37 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 
-BISECTIONS: Final = 10  # which find a target to a thousandth of the set point
-LOGISTIC: Final = 1.702  # scale of the logistic distribution that is next to the normal one
+BISECTIONS: Final = 10  # 2^-10: they find a target to a thousandth of the set point
+# The logistic function of LOGISTIC x is within 0.01 of the standard normal distribution of x.
+LOGISTIC: Final = 1.702
 
 
 @dataclass(frozen=True)
 class RandomSetpoint:
-    """A set point with levels that are uniform, and held for a time that is uniform, too.
+    """The distribution of a set point that changes at random, for n control loops.
 
-    The fields are those of n loops, numbers or arrays of shape (n,). The amplitude has the unit
-    of the set points.
+    The set point is piecewise constant. Its *levels*, the values between changes, are uniformly
+    distributed and independent, and the number of samples for which a level lasts is uniformly
+    distributed. Each field is a number for all loops, or an array of shape (n,).
     """
 
     shortest: Array | float
-    """Least number of samples for which a level is held."""
+    """Least number of samples for which the set point keeps a level."""
     longest: Array | float
-    """Greatest number of samples for which a level is held."""
+    """Greatest number of samples for which the set point keeps a level."""
     amplitude: Array | float
-    """Greatest level; the least one is its negative."""
+    """Greatest level of the set point, in the unit of the set points; the least level is
+    `-amplitude`."""
 
     def probability_held(self, ages: Array, ahead: Array) -> Array:
-        """Return the probability that a level still holds `ahead` samples later, shape (n,).
+        """Return the probability that the set point does not change soon, shape (n,).
 
-        `ages` are the samples since the level began. Both have the shape (n,).
+        Parameters
+        ----------
+        ages
+            Number of samples since the last change of the set point, shape (n,).
+        ahead
+            Number of future samples within which the set point shall not change, shape (n,).
         """
         lengths = self.longest - self.shortest + 1.0
         later = np.clip((self.longest - ages - ahead) / lengths, 0.0, 1.0)
@@ -45,24 +54,28 @@ class RandomSetpoint:
         return probability
 
     def targets(self, setpoints: Array, held: Array, deviations: Array) -> Array:
-        """Return the outputs to aim at, with the least expected absolute error, shape (n,).
+        """Return the target outputs with the least expected absolute error, shape (n,).
 
-        The set point s stays with the probability `held`; otherwise a new one is uniform
-        between -A and A, the amplitude. The output will differ from the target r by an error of
-        the forecast, whose standard deviation is `deviations`. The best r is a median, at which
+        The set point keeps its value s with the probability `held`; otherwise, the next set
+        point is uniformly distributed between -A and A, the amplitude. The output will differ
+        from the target r by an error of the forecast with the standard deviation `deviations`.
+        The expected absolute error is least at the target r for which
 
-            held tanh(LOGISTIC (r - s) / (2 deviation)) + (1 - held) r / A = 0.
+            held tanh(LOGISTIC (r - s) / (2 deviations)) + (1 - held) r / A = 0.
 
-        This takes the error of the forecast for logistic, and small beside A. The left side
-        rises with r, so bisection between 0 and s finds r.
+        In the equation, the error of the forecast is assumed to have a logistic distribution,
+        and to be small compared with A. The left side of the equation rises with r, so
+        bisection between 0 and s finds r.
 
         Parameters
         ----------
-        setpoints, deviations
-            Present set points, and standard deviations of the forecasts' errors, in the unit of
-            the amplitude, shape (n,).
+        setpoints
+            Present set points s, in the unit of the amplitude, shape (n,).
         held
-            Probabilities that the set points stay, shape (n,).
+            Probabilities that the set points do not change within the delay, shape (n,).
+        deviations
+            Standard deviations of the forecasts' errors, in the unit of the amplitude, shape
+            (n,).
         """
         slopes = 0.5 * LOGISTIC / deviations
         pulls = (1.0 - held) / self.amplitude

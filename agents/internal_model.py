@@ -1,4 +1,4 @@
-"""Define what controllers with a model of the plant inside them have in common."""
+"""Define the base class of controllers that run a model of the plant."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Array = NDArray[np.float64]
 
 @dataclass(eq=False, kw_only=True)
 class InternalModelController(ModelBasedController):
-    """A controller that runs a model of the plant beside it.
+    """A controller that runs a first-order model with a delay, in parallel with the plant.
 
-    The model is of first order, with a delay. Its input is the flow that the actuator passes,
-    after the dead zone and the limits; so its outputs are right whatever was commanded. The
-    parameters are those of `ModelBasedController`.
+    The input of the model is the flow that the actuator passes after dead zone and limits, so
+    saturation of the actuator does not make the model wrong. The parameters are those of
+    `ModelBasedController`.
     """
 
     def __post_init__(self) -> None:
@@ -31,27 +31,37 @@ class InternalModelController(ModelBasedController):
         self._delay = max(round(self._delay_samples), 1)
 
     def reset(self) -> None:
-        """Return the model to rest."""
+        """Set the model's outputs to 0, as for a plant at rest, before a new episode."""
         super().reset()
         self._outputs: list[Values] = []  # of the undelayed model, degC; the newest is last
 
     @property
     def _undelayed(self) -> Values:
-        """Output of the model without its delay, degC: all inputs so far have arrived."""
+        """The output of the model if it had no delay, degC; shape (loops,), or () at first."""
         return self._outputs[-1] if self._outputs else np.float64(0.0)
 
     @property
     def _delayed(self) -> Values:
-        """Output of the model with its delay, degC: what the plant should show now."""
+        """The output of the model with its delay, degC; shape (loops,), or () at first.
+
+        If the model is right, a plant without noise and load has this output now.
+        """
         return self._outputs[0] if self._outputs else np.float64(0.0)
 
     def _passable(self, command: Array) -> Array:
-        """Return the command, moved to 0 or the edge of the dead zone if it is inside, t/h."""
+        """Return commands of which none lies inside the dead zone, t/h, shape (loops,).
+
+        `command` are the wanted flows, t/h, shape (loops,). A wanted flow inside the dead zone
+        is moved to 0 or to the edge of the dead zone, whichever is nearer.
+        """
         passable: Array = avoid_dead_zone(command, self.dead_zone)
         return passable
 
     def _advance(self, command: Array) -> None:
-        """Let the model take a sample with what the actuator passes of a command, t/h."""
+        """Advance the model by a sample, with the flow that the actuator passes.
+
+        `_control` calls this method with its final commands, t/h, shape (loops,).
+        """
         applied = applied_flow(command, self.dead_zone, self.u_min, self.u_max)
         outputs = self._outputs or [np.float64(0.0)] * self._delay
         newest = self._pole * outputs[-1] + self._input_gain * applied

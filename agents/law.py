@@ -1,11 +1,12 @@
-"""Choose flows by the predictions of a bank of models and of a filter.
+"""Choose flows by the predictions of a bank of models and of a Kalman filter.
 
-As in a Smith predictor, the models predict the response to flows that are in transit. The
-filter forecasts the part of the output that the models do not explain. The flow moves the
-predicted output towards its target.
+As in a Smith predictor, the models predict the effect of flows that have not yet shown in the
+output. The Kalman filter forecasts the part of the output that the models do not explain. The
+next flow moves the predicted output towards a target.
 
-The control law is written once for two libraries: it runs in NumPy, and in PyTorch a network
-that corrects it is trained. Quantities are scaled as in `agents.bank`.
+The control law runs both in NumPy and in PyTorch. With PyTorch, a neural network that corrects
+the control law is trained by gradients. Quantities are scaled as in `agents.bank`: flows by
+half the actuator's range, temperatures by the authority, and times by the sampling interval.
 """
 
 from __future__ import annotations
@@ -24,57 +25,75 @@ from agents.output_filter import LOAD_CHANGES, OutputFilter
 
 Array = NDArray[np.floating[Any]]
 
-SHARE: Final = 0.5  # of the way to the target that a sample covers, without a network
-FORECAST_SPREAD: Final = 1.2  # error of a forecast over the delay, in units of the noise
-REACTION: Final = 2.0  # samples after the delay, by which the output follows a flow
-OUTLIER: Final = 12.0  # multiples of the noise, beyond which a network sees no difference
-DOUBT: Final = 0.002  # of the authority, added to the noise that signals are divided by
-TYPICAL_DELAY: Final = 18.0  # samples, that of (28)
-TYPICAL_LOG_CONSTANT: Final = 3.0  # natural logarithm of its time constant in samples
+SHARE: Final = 0.5  # share of the way to the target that one sample covers, without a network
+# Standard deviation of the error of a forecast over the delay, divided by that of the noise.
+FORECAST_SPREAD: Final = 1.2
+REACTION: Final = 2.0  # samples that the output takes, after the delay, to follow a flow
+# Signals of a network are limited to this multiple of the noise, as larger ones are outliers.
+OUTLIER: Final = 12.0
+# Added to the noise before signals are divided by the noise, of the authority, so that tiny
+# model errors are not taken for signals where there is hardly any noise.
+DOUBT: Final = 0.002
+# A typical delay, samples, and a typical natural logarithm of a time constant in samples: those
+# of the plant, equation (28) of the paper. They centre the inputs of a network.
+TYPICAL_DELAY: Final = 18.0
+TYPICAL_LOG_CONSTANT: Final = 3.0
 
-# Of a network: what it sees of the past, and of the law's state; and what it corrects.
+# Numbers of inputs and outputs of a network. `PAST_INPUTS` inputs come from the observer, and
+# five more from the control law's models and last flow. The outputs correct the control law.
 PAST_INPUTS: Final = 21 + LAGS + len(LOAD_CHANGES)
 INPUTS: Final = PAST_INPUTS + 5
 OUTPUTS: Final = 3
 
-# From inputs, shape (n, INPUTS), to outputs, shape (n, OUTPUTS).
+# A network maps inputs of shape (n, INPUTS), for n loops, to outputs of shape (n, OUTPUTS).
 Network = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
 class Situation:
-    """The knowledge of n loops at a sample, by which they choose their flows."""
+    """The knowledge about n control loops at a sample, by which flows are chosen."""
 
     targets: Array
-    """Wanted outputs of the models when the next flows show: the set point, hedged, less the
-    forecast residual, shape (n,)."""
+    """Target of the mean model's output at the time when the present flow shows, of the
+    authority, shape (n,): the hedged set point (see `agents.hedge`) minus the forecast of the
+    part of the output that the models do not explain."""
     estimate: Estimate
+    """The bank's estimates of delays and time constants."""
     gain: Array
-    """Gain, as a multiple of the step test's, shape (n,)."""
+    """Estimated gain of the plant, as a multiple of the step test's gain, shape (n,)."""
     gain_spread: Array
-    """Standard deviation of the gain, shape (n,)."""
+    """Standard deviation of `gain`, shape (n,)."""
     noise: Array
-    """Standard deviation of one-step errors, plus `DOUBT`, of the authority, shape (n,)."""
+    """Standard deviation of the bank's one-step errors, plus `DOUBT`, of the authority, shape
+    (n,)."""
     inputs: Array
-    """Inputs of a network that do not depend on the present flow, shape (n, PAST_INPUTS)."""
+    """Inputs of a network that come from the observer, shape (n, PAST_INPUTS)."""
 
 
 class Observer:
-    """The memory of n loops: the bank of models, the filter, and the age of the set point.
+    """The memory of n control loops: bank of models, Kalman filters, and age of the set point.
 
-    The observer is NumPy alone, so no gradient passes through it.
+    The observer uses NumPy alone, so no gradient of PyTorch passes through the observer.
 
     Parameters
     ----------
     bank
-        The bank of models, for n loops at rest.
+        The bank of models, for n plants at rest.
     edge
-        Widest edge of the dead zone, of half the range, shape (n,); 0 without one.
+        Greatest half width that the dead zone may have, as a share of half the actuator's
+        range, shape (n,); 0 for an actuator without a dead zone.
     limits
-        Lowest and highest flow, each of shape (n,).
+        Lowest and highest flow, as shares of half the actuator's range, each of shape (n,).
     setpoint
         The distribution of random set points, with amplitudes as shares of the authority; None
         if nothing is known about changes of the set points.
+
+    Attributes
+    ----------
+    bank : Bank
+        The bank of models.
+    filter : OutputFilter
+        The Kalman filters of gain and load.
     """
 
     def __init__(
@@ -94,9 +113,16 @@ class Observer:
         self._k = 0
 
     def observe(self, setpoint: Array, output: Array) -> Situation:
-        """Take the set points and outputs of a sample, of the authority, shape (n,).
+        """Update the memory with a sample of each loop, and return the present situation.
 
-        The situation that is returned includes them.
+        Call this method once per sample, before the flow is chosen.
+
+        Parameters
+        ----------
+        setpoint
+            Set points y_d(k), of the authority, shape (n,).
+        output
+            Measured outputs y(k), of the authority, shape (n,).
         """
         bank = self.bank
         bank.observe(output)
@@ -123,9 +149,27 @@ class Observer:
     def _inputs(
         self, output: Array, aim: Array, held: Array, forecast: Array, noise: Array
     ) -> Array:
-        """Return the inputs of a network from the past, shape (n, PAST_INPUTS).
+        """Return the observer's inputs of a network, scaled to be of order 1.
 
-        `aim` is the hedged set point, and `held` the probability that the set point stays.
+        Parameters
+        ----------
+        output
+            Measured outputs y(k), of the authority, shape (n,).
+        aim
+            Hedged set points, of the authority, shape (n,).
+        held
+            Probabilities that the set points do not change before the present flow shows,
+            shape (n,).
+        forecast
+            Forecasts of the part of the output that the models do not explain, of the
+            authority, shape (n,).
+        noise
+            Standard deviations of one-step errors, plus `DOUBT`, of the authority, shape (n,).
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (n, PAST_INPUTS).
         """
         bank, estimate = self.bank, self.bank.estimate
         setpoint = self._setpoint
@@ -161,34 +205,41 @@ class Observer:
 
 
 def _limited(signals: Array) -> Array:
-    """Return half of signals that were divided by the noise, limited to `OUTLIER` times it."""
+    """Return half of the signals, after limiting them to +-`OUTLIER`, in the same shape.
+
+    `signals` are divided by the standard deviation of the noise.
+    """
     limited: Array = 0.5 * np.clip(signals, -OUTLIER, OUTLIER)
     return limited
 
 
 class Law:
-    """The control law of n loops: from a situation to flows.
+    """The control law of n control loops: it computes flows from a `Situation`.
 
-    With the mean model's output m, its gain g and its pole p, and the target r, the flow is
+    The mean model has the output m without delay, the gain g and the pole p. For the target r,
+    the flow is
 
         f = (r + share (r - m) / (1 - p)) / g,
 
-    moved out of the dead zone and limited. The first term holds m at r, and the second closes a
-    share of the gap in one sample. A network, if there is one, has three outputs: an addition
-    to r in units of the noise, a relative change of r in units of the gain's standard
-    deviation, and half the logit of the share.
+    moved out of the dead zone and limited. The term r / g is the flow that keeps m at r, and
+    the other term closes a share of the gap r - m in one sample. A neural network can correct
+    the control law by three outputs: an addition to r in units of the noise, a relative change
+    of r in units of the gain's standard deviation, and half the logit of the share.
 
     Parameters
     ----------
     bank
-        The bank, whose models without delay the law runs itself, so that gradients reach past
-        flows.
+        The bank of models. The control law runs the bank's models without delay once more, so
+        that the gradients of PyTorch reach past flows.
     edge
-        Widest edge of the dead zone, of half the range, shape (n,); 0 without one.
+        Greatest half width that the dead zone may have, as a share of half the actuator's
+        range, shape (n,); 0 for an actuator without a dead zone.
     limits
-        Lowest and highest flow, each of shape (n,).
-    xp, convert
-        The array module, NumPy or PyTorch, and what makes its arrays from those of NumPy.
+        Lowest and highest flow, as shares of half the actuator's range, each of shape (n,).
+    xp
+        The array module: NumPy, or PyTorch to compute gradients.
+    convert
+        Function that converts a NumPy array to an array of `xp`.
     """
 
     def __init__(
@@ -204,16 +255,25 @@ class Law:
         self._edge = convert(edge)
         self._low, self._high = map(convert, limits)
         self._coefficients = tuple(map(convert, second_order(bank.time_constants)))
-        # The undelayed responses of the models, those of a sample before, and the last flow.
+        # Outputs of the models with gain 1 and no delay at the present and at the last sample,
+        # shape (time constants, n), and the last flow, shape (n,).
         self._response = convert(np.zeros_like(bank.time_constants))
         self._before = self._response
         self._flow = convert(np.zeros(bank.n, np.float32))
 
     def flow(self, situation: Situation, network: Network | None = None) -> Any:
-        """Return the flows of half the actuator's range, shape (n,).
+        """Return the flows of a sample, as shares of half the actuator's range, shape (n,).
 
-        Each flow is 0 or passes the dead zone. Without a network, the control law is linear
-        apart from the dead zone and the limits.
+        Each flow is 0 or passes the dead zone, and lies within the limits. The models advance
+        by a sample with these flows, so call this method once per sample.
+
+        Parameters
+        ----------
+        situation
+            The knowledge about the loops at this sample, from `Observer.observe`.
+        network
+            The network that corrects the control law. Without a network, the control law is
+            linear apart from the dead zone and the limits.
         """
         convert = self._convert
         estimate = situation.estimate
@@ -233,7 +293,11 @@ class Law:
         return self._passing((target + share / rate * (target - model)) / gain)
 
     def _inputs(self, situation: Situation, model: Any, slope: Any) -> Any:
-        """Return the inputs of a network, shape (n, INPUTS)."""
+        """Return all inputs of a network, shape (n, INPUTS), of order 1.
+
+        `model` is the output of the mean model without delay, and `slope` its change since the
+        last sample, both of the authority, shape (n,). `flow` calls this method.
+        """
         xp = self._xp
         gap = self._convert(situation.targets) - model
         noise = self._convert(situation.noise)
@@ -242,13 +306,15 @@ class Law:
         return xp.concatenate([past, xp.stack(signals, axis=1)], axis=1)
 
     def _exp(self, exponents: Any) -> Any:
-        """Return exponentials, without an overflow where a network sees nonsense."""
+        """Return exp of `exponents`, which are limited to +-20 so that exp cannot overflow."""
         return self._xp.exp(self._xp.clip(exponents, -20.0, 20.0))
 
     def _passing(self, wanted: Any) -> Any:
-        """Return flows that pass the dead zone and the limits, and let the models follow them.
+        """Return wanted flows moved out of the dead zone and limited, and advance the models.
 
-        The gradient goes straight through the dead zone.
+        `wanted` are the flows of the control law, as shares of half the actuator's range, shape
+        (n,). For gradients, the move out of the dead zone is a constant (straight-through
+        estimator).
         """
         xp = self._xp
         value = wanted.detach() if hasattr(wanted, "detach") else wanted
@@ -262,7 +328,7 @@ class Law:
         return flow
 
     def detach(self) -> None:
-        """Cut the graph of PyTorch that leads to earlier flows."""
+        """Cut the PyTorch graph, so that later gradients do not reach earlier flows."""
         self._response = self._response.detach()
         self._before = self._before.detach()
         self._flow = self._flow.detach()

@@ -1,6 +1,6 @@
-"""Run trained feed-forward networks, policies among them, in NumPy alone.
+"""Run trained feed-forward networks in NumPy alone, and read and write network files.
 
-Their files may come from untrusted sources: nothing in them is executed.
+A network file may come from an untrusted source: nothing in the file is executed.
 """
 
 from __future__ import annotations
@@ -19,12 +19,17 @@ from numpy.typing import ArrayLike, NDArray
 from agents.controller import Controller, Index, NotNegative, Values, check, check_numbers
 
 Array = NDArray[np.floating[Any]]
-# Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
+# The layers of a network, from the inputs on: a pair of weights, shape (outputs, inputs), and
+# biases, shape (outputs,), for each layer.
 Layers = Sequence[tuple[Array, Array]]
 
+# Arguments of the environment that determine the observation, in the order of its elements.
 WINDOWS: Final = ("setpoint_window", "error_window", "output_window", "action_window")
-PRETRAINED: Final = Path(__file__).parent / "pretrained"  # networks that come with the project
-LARGEST: Final = 2**26  # bytes of all arrays, unpacked: hundreds of times what a network needs
+PRETRAINED: Final = Path(__file__).parent / "pretrained"  # trained networks of this project
+# Largest size of a network file, bytes of all its unpacked arrays: 64 MiB, hundreds of times
+# what a network needs. A larger file could exhaust the memory.
+LARGEST: Final = 2**26
+# The activation functions of hidden layers, by name.
 ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
     "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
     "relu": lambda x: np.maximum(x, 0.0),
@@ -34,10 +39,20 @@ ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
 
 
 def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.float64]:
-    """Return outputs, shape (..., outputs), for inputs; the last layer has no activation.
+    """Return the outputs of a feed-forward network, shape (..., outputs).
 
-    It is computed in float32, in which the networks were trained. BLAS rounds sums of a batch
-    in another order than those of a single row, so that they can differ by some 1e-6.
+    The network is computed in float32, as in its training. A matrix product of a batch adds
+    terms in another order than that of a single row, so the outputs for the same inputs can
+    differ by about 1e-6 between batch sizes.
+
+    Parameters
+    ----------
+    layers
+        Weights and biases of each layer. The last layer has no activation.
+    activation
+        Name of the activation of the hidden layers, a key of `ACTIVATIONS`.
+    inputs
+        Inputs of the network, shape (..., inputs).
     """
     x = np.asarray(inputs, np.float32)
     *hidden, (last_W, last_b) = layers
@@ -49,8 +64,26 @@ def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.fl
 def check_array(
     name: str, value: ArrayLike, *shapes: tuple[int, ...], dtype: Any = np.float32
 ) -> NDArray[Any]:
-    """Return a copy if it has one of the shapes and is finite; otherwise raise a ValueError."""
-    with np.errstate(over="ignore"):  # too large for float32 is infinite there, and refused
+    """Return a copy of an array that has an allowed shape and only finite values.
+
+    Parameters
+    ----------
+    name
+        Name of the array, for the message of an error.
+    value
+        The array to check.
+    *shapes
+        The allowed shapes.
+    dtype
+        Type of the copy's elements.
+
+    Raises
+    ------
+    ValueError
+        If the array has another shape, is not numeric, or has a value that is not finite.
+    """
+    # A number that is too large for float32 becomes infinite, which is refused below.
+    with np.errstate(over="ignore"):
         array = np.array(check_numbers(name, value), dtype)
     if array.shape not in shapes:
         raise ValueError(f"{name} must have shape {shapes[-1]}, got {array.shape}")
@@ -60,7 +93,12 @@ def check_array(
 
 
 def check_layers(layers: Layers, inputs: int, outputs: int) -> list[tuple[Array, Array]]:
-    """Return the layers in float32 if each fits the one before it; otherwise a ValueError."""
+    """Return copies of a network's layers in float32, if their shapes fit.
+
+    `inputs` and `outputs` are the numbers of inputs and outputs that the network must have. A
+    ValueError is raised if there is no layer, if the shape of a layer does not fit the layer
+    before or these numbers, or if a value is not finite.
+    """
     if not layers:
         raise ValueError("layers must hold at least one layer, got none")
     checked = []
@@ -74,10 +112,24 @@ def check_layers(layers: Layers, inputs: int, outputs: int) -> list[tuple[Array,
 
 @contextmanager
 def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDArray[Any]]]:
-    """Yield the arrays of an `.npz` file by name. Nothing in the file is executed.
+    """Open an `.npz` file as a mapping of arrays by name, for a `with` statement.
 
-    If it is damaged or absurdly large, or the `with` block rejects its contents, a ValueError
-    says what it should hold.
+    Nothing in the file is executed.
+
+    Parameters
+    ----------
+    path
+        The file.
+    holds
+        What the file should hold, in words, for the message of an error.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged or larger than `LARGEST`, or if the `with` block raises an error
+        because of the file's contents.
+    OSError
+        If the file cannot be opened.
     """
     with Path(path).open("rb") as raw:
         try:
@@ -91,12 +143,27 @@ def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDAr
 
 
 def read_layers(file: Mapping[str, Array], layers: int, prefix: str = "") -> Layers:
-    """Return the layers that have the names that `write` gives."""
+    """Return the layers of a network from a file that was written by `write`.
+
+    `file` is what `reading` yields, `layers` the number of layers, and `prefix` the network's
+    key in the argument `layers` of `write`.
+    """
     return [(file[f"{prefix}W{i}"], file[f"{prefix}b{i}"]) for i in range(layers)]
 
 
 def write(path: str | PathLike[str], layers: Mapping[str, Layers], **arrays: Any) -> None:
-    """Write layers, by the prefix of their names, and other arrays to an `.npz` file."""
+    """Write networks and other arrays to an `.npz` file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    layers
+        The layers of each network. The key is a prefix for the names of the network's arrays:
+        layer i has the arrays `{prefix}W{i}` and `{prefix}b{i}`.
+    **arrays
+        Other arrays, by their names in the file.
+    """
     for prefix, each in layers.items():
         for i, (W, b) in enumerate(each):
             arrays |= {f"{prefix}W{i}": W, f"{prefix}b{i}": b}
@@ -106,14 +173,20 @@ def write(path: str | PathLike[str], layers: Mapping[str, Layers], **arrays: Any
 
 @dataclass(frozen=True)
 class Increments:
-    """Velocity form: the network's output changes the wanted flow, which is 0 at first."""
+    """Settings of a network in velocity form, whose output changes a *wanted flow*.
+
+    The wanted flow is 0 at the start of an episode. The command follows from the wanted flow by
+    a compensation of the actuator's dead zone.
+    """
 
     max_move: float
-    """Change of the wanted flow per sample at an output of 1, as a share of half the range."""
+    """Change of the wanted flow per sample if the network's output is 1, as a share of half the
+    actuator's range."""
     dead_zone: float = 0.0
-    """Half width z of the dead zone to compensate, t/h, or 0. Wanted flows v are spread over
-    those that pass: the command is z + (u_max - z) v / u_max above 0, 0 at 0, and below
-    -z + (u_min + z) v / u_min. A limit inside the zone is reached by commanding its edge."""
+    """Half width z of the dead zone that is compensated, t/h; 0 for no compensation. A wanted
+    flow v of 0 gives the command 0, a positive v gives z + (u_max - z) v / u_max, and a
+    negative v gives -z + (u_min + z) v / u_min. If a limit of the flow lies inside the dead
+    zone, the edge of the dead zone is commanded instead of this limit."""
 
     def __post_init__(self) -> None:
         check("max_move", self.max_move, NotNegative)
@@ -124,28 +197,30 @@ class Increments:
 class PolicyNetwork(Controller):
     """A feed-forward network from the latest observation to an action.
 
-    The observation is multiplied by `input_scale` and passed through the layers. The activation
-    follows every layer but the last, whose single output is clipped to [-1, 1]. This output is
-    the action or, with `increments`, moves the wanted flow. The layers are run in float32, so a
-    loop in a batch can differ from a single one by rounding; see `forward`.
+    The observation is multiplied by `input_scale` and passed through the layers. An activation
+    follows every layer but the last layer, whose single output is clipped to [-1, 1]. The
+    clipped output is the action or, with `increments`, changes a wanted flow. The layers are
+    computed in float32, so the actions of a loop in a batch can differ by rounding from those
+    of a single loop; see `forward`.
 
-    `u_min` and `u_max` are those of `Controller`.
+    The arguments `u_min` and `u_max` are those of `Controller`.
 
     Parameters
     ----------
     layers
         Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
     observation
-        The windows that the network expects, by the environment's arguments `setpoint_window`,
-        `error_window`, `output_window` and `action_window`; 0 where not named.
+        The observation that the network expects: the environment's arguments `setpoint_window`,
+        `error_window`, `output_window` and `action_window`, by name. An argument that is not
+        named is 0.
     input_scale
         Factor for each element of the observation; shape (n_obs,).
     activation
         Activation of the hidden layers: "elu", "relu", "silu" or "tanh".
     increments
-        The velocity form, if the network was trained in it; otherwise None.
+        Settings of the velocity form; None if the network's output is the action itself.
     provenance
-        Origin of the weights, JSON-serialisable.
+        How the network was trained, for the network's file; JSON-serialisable.
     """
 
     layers: Layers = field(repr=False, kw_only=False)
@@ -178,7 +253,22 @@ class PolicyNetwork(Controller):
     def load(
         cls, path: str | PathLike[str], *, u_min: float = -10.0, u_max: float = 10.0
     ) -> PolicyNetwork:
-        """Read a network written by `save`; errors are those of `reading` and of the limits."""
+        """Return the network in a file that was written by `save`.
+
+        Parameters
+        ----------
+        path
+            The file.
+        u_min, u_max
+            Limits of the actuator, t/h, as of `Controller`; files do not hold limits.
+
+        Raises
+        ------
+        ValueError
+            If the file is damaged or holds something else, or if a limit is out of range.
+        OSError
+            If the file cannot be opened.
+        """
         with reading(path, "policy network") as file:
             about = json.loads(str(file["about"]))
             if about["format"] != 1:
@@ -192,10 +282,11 @@ class PolicyNetwork(Controller):
                 increments=None if increments is None else Increments(**increments),
                 provenance=about["provenance"],
             )
-        return replace(network, u_min=u_min, u_max=u_max)  # no errors of a damaged file
+        # Outside the `with` block: invalid limits do not mean that the file is damaged.
+        return replace(network, u_min=u_min, u_max=u_max)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the network to a `.npz` file."""
+        """Write the network, without the limits of the flow, to the `.npz` file `path`."""
         about = {
             "format": 1,
             "layers": len(self.layers),
@@ -207,7 +298,11 @@ class PolicyNetwork(Controller):
         write(path, {"": self.layers}, about=json.dumps(about), input_scale=self.input_scale)
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
-        """Refuse plants that the network was not made for; see `Controller`."""
+        """Refuse plants that the network was not made for, by a ValueError.
+
+        The arguments are those of `Controller.check_environment`. In addition to the checks of
+        `Controller`, the plants must have the observation that the network expects.
+        """
         super().check_environment(parameters, wrapped, n)
         given = {name: getattr(parameters, name) for name in WINDOWS}
         if given != self.observation:
@@ -216,11 +311,15 @@ class PolicyNetwork(Controller):
             )
 
     def reset(self) -> None:
-        """Forget the episode, which is the wanted flow in velocity form."""
+        """Set the wanted flow of the velocity form to 0, before a new episode."""
         super().reset()
         self._flow: Values = np.float64(0.0)  # wanted, as a share of half the range
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the commands u(k), t/h, shape (loops,), and update the wanted flow.
+
+        `rows` are the observations, shape (loops, n_obs); any other size raises a ValueError.
+        """
         if rows.shape[1] != self.n_obs:
             raise ValueError(
                 f"observation must have {self.n_obs} elements, got {rows.shape[1]}: "

@@ -1,6 +1,7 @@
-"""Estimate the gain of a plant and the load on it, and forecast its output.
+"""Estimate a plant's gain and load disturbance by Kalman filters, and forecast its output.
 
-Quantities are scaled as in `agents.bank`.
+Quantities are scaled as in `agents.bank`: flows by half the actuator's range, temperatures by
+the authority, and times by the sampling interval.
 """
 
 from __future__ import annotations
@@ -14,48 +15,56 @@ from agents.bank import CAUTION, FAST_POLE, GAINS, NOISE_COLOUR
 
 Array = NDArray[np.floating[Any]]
 
-# The assumptions of each filter: the standard deviation of the change of the load in a sample,
-# as a share of the authority, and the share of noise in the bank's one-step variance. The last
-# filter is for plants with hardly any noise, where the bank's errors come from the load.
+# Each of the four filters assumes a standard deviation of the change of the load per sample, as
+# a share of the authority (`LOAD_CHANGES`), and a noise variance, as a share of the variance of
+# the bank's one-step errors (`NOISE_SHARES`). The last filter is for plants with hardly any
+# noise, where the bank's one-step errors come from the load.
 LOAD_CHANGES: Final = np.array([0.001, 0.007, 0.03, 0.03])
 NOISE_SHARES: Final = np.array([1.0, 1.0, 1.0, 0.25])
 LOAD_MEMORY: Final = 0.998  # share of the load that is expected to remain after a sample
-GAIN_CHANGE: Final = 0.004  # standard deviation of the change of an uncertain gain in a sample
-REFERENCE_SPREAD: Final = 0.25  # first spread of a gain that changes by `GAIN_CHANGE`
-FILTER_MEMORY: Final = 0.998  # factor a sample of the filters' log-likelihoods
-READING_SHARE: Final = 0.1  # of the noise variance, due to the transmitter
+# Standard deviation of the change of the gain per sample, as a share of the step test's gain,
+# for a gain whose standard deviation before the first sample is `REFERENCE_SPREAD`.
+GAIN_CHANGE: Final = 0.004
+REFERENCE_SPREAD: Final = 0.25
+FILTER_MEMORY: Final = 0.998  # forgetting factor of the filters' log-likelihoods, per sample
+READING_SHARE: Final = 0.1  # share of the noise variance that is noise of the transmitter
 
-RESIDUAL, OLDER, LOAD, GAIN = range(4)  # the elements of the state
+RESIDUAL, OLDER, LOAD, GAIN = range(4)  # places of the elements in the state of a filter
 
 
 class OutputFilter:
-    """Kalman filters of the outputs of n plants, which differ in what they assume of the load.
+    """Kalman filters of the outputs of n plants; they differ in their assumptions on the load.
 
-    The output y(k) is g(k) s(k) + v(k). s is the response of the mean model, with gain 1, to
-    past flows. The residual v is noise of (28) and the response to a load w:
+    The output is y(k) = g(k) s(k) + v(k), where g is the plant's gain, and s the output of the
+    bank's mean model with gain 1 for the past flows. The residual v is the sum of noise and of
+    the effect of a load disturbance w:
 
         v(k) = a1 v(k-1) + a2 v(k-2) + (1 - a1 - a2) w(k) + xi(k) + c xi(k-1)
         w(k) = LOAD_MEMORY w(k-1) + eta(k)
 
-    a1 and a2 follow from the pole of the mean model, and c is the first coefficient of C. The
-    gain g changes by a random walk. The state of a filter is v(k), a2 v(k-1) + c xi(k), w(k)
-    and g(k). The filters differ in the standard deviation of eta and in the variance of xi. The
-    filters are weighted by the likelihood of their one-step errors, and forget exponentially.
+    The noises xi and eta are white. The coefficients a1 and a2 follow from the poles of the
+    mean model, and c is the coefficient of z^-1 in the polynomial C of equation (28) of the
+    paper. The gain g changes by a random walk. The state of a filter is v(k), a2 v(k-1) +
+    c xi(k), w(k) and g(k). The filters differ in the standard deviation of eta and in the
+    variance of xi. A filter is weighted by the likelihood of its one-step errors, in which old
+    errors are forgotten exponentially.
 
     Parameters
     ----------
     gain_spread
-        Standard deviation of the gain before the first sample, as a share of the step test's,
-        shape (n,). The gain changes in proportion to it.
+        Standard deviation of the gain before the first sample, as a share of the step test's
+        gain, shape (n,). The larger `gain_spread`, the faster the gain may change.
 
     Attributes
     ----------
     gain, gain_spread : ndarray
-        Mean and standard deviation of the gain, as multiples of the step test's, shape (n,).
+        Mean and standard deviation of the gain, as multiples of the step test's gain, shape
+        (n,).
     load : ndarray
         Mean of the load w, of the authority, shape (n,).
     innovation : ndarray
-        Newest one-step error of the output, mean over the filters, shape (n,).
+        Newest one-step error of the output, mean over the filters, of the authority, shape
+        (n,).
     weights : ndarray
         Probabilities of the filters, shape (filters, n).
     """
@@ -76,18 +85,19 @@ class OutputFilter:
         self._summarise()
 
     def update(self, output: Array, responses: Array, poles: Array, variances: Array) -> None:
-        """Learn from the outputs of a sample.
+        """Update all filters with the outputs of a sample; call this method once per sample.
 
         Parameters
         ----------
         output
-            y(k), shape (n,).
+            Measured outputs y(k), of the authority, shape (n,).
         responses
-            s(k) and s(k-1) of the present mean models, shape (2, n).
+            Outputs s(k) and s(k-1) of the bank's present mean models with gain 1, shape (2, n).
         poles
-            Poles of the mean models' time constants, shape (n,).
+            Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
+            (n,).
         variances
-            Variances of the bank's one-step errors, shape (n,).
+            Variances of the bank's one-step errors, of the authority squared, shape (n,).
         """
         response, previous = responses
         self._follow(previous - self._response, poles)
@@ -112,10 +122,19 @@ class OutputFilter:
         self._summarise()
 
     def forecast(self, poles: Array, fading: Array) -> Array:
-        """Return the residuals that are expected when the next flows show, shape (n,).
+        """Return forecasts of the residuals v at the time when the present flows show, (n,).
 
-        By then, the fast part of the residual is over, the slow part has faded by the factor
-        `fading`, and the load has taken its place. The load is expected not to change.
+        The residual v is the part of the output, of the authority, that the bank's mean model
+        does not explain. In d + 1 samples, for the delay d, the fast part of v decays to 0, and
+        the slow part of v moves from its present value to the load. The load is expected not to
+        change.
+
+        Parameters
+        ----------
+        poles
+            Slow poles of the mean models, shape (n,).
+        fading
+            Share of the distance between slow part and load that remains, shape (n,).
         """
         slow = (poles * self._mean[RESIDUAL] + self._mean[OLDER]) / (poles - FAST_POLE)
         slow_of_load = self.load * poles * (1.0 - FAST_POLE) / (poles - FAST_POLE)
@@ -123,9 +142,12 @@ class OutputFilter:
         return forecasts
 
     def _follow(self, changes: Array, poles: Array) -> None:
-        """Keep the outputs where the mean models, and so the responses, have changed.
+        """Move part of the output from the model to the load, after a change of the mean model.
 
-        What the new models explain less is taken for a load that has lasted for long.
+        The probabilities of the bank's models change with time, and then the mean model
+        explains more or less of the same past output. The difference is attributed to a load
+        that has been constant for long. `changes` are the changes of s(k-1), shape (n,), and
+        `poles` the slow poles of the mean models, shape (n,).
         """
         residuals = -self._states[:, :, GAIN] * changes
         self._states[:, :, RESIDUAL] += residuals
@@ -133,10 +155,22 @@ class OutputFilter:
         self._states[:, :, LOAD] += residuals
 
     def _matrices(self, poles: Array, noises: Array) -> tuple[Array, Array]:
-        """Return the state transitions and the covariances of the disturbances of a sample.
+        """Return the matrices of the filters' state equations for a sample.
 
-        `noises` are the noise variances that the filters assume, shape (filters, n). The
-        transitions have the shape (n, 4, 4), and the covariances (filters, n, 4, 4).
+        Parameters
+        ----------
+        poles
+            Slow poles of the mean models, shape (n,).
+        noises
+            Noise variances that the filters assume, of the authority squared, shape
+            (filters, n).
+
+        Returns
+        -------
+        transition : ndarray
+            State transition matrices, shape (n, 4, 4).
+        covariances : ndarray
+            Covariances of the noise that enters the states, shape (filters, n, 4, 4).
         """
         n = len(poles)
         a1 = poles + FAST_POLE
@@ -160,7 +194,11 @@ class OutputFilter:
         return transition, covariances
 
     def _weigh(self, errors: Array, variances: Array) -> None:
-        """Renew the filters' probabilities by their one-step errors, shape (filters, n)."""
+        """Update the probabilities of the filters, `weights`, and `innovation`.
+
+        `errors` are the filters' one-step errors at this sample, of the authority, and
+        `variances` the variances that the filters expected, both of shape (filters, n).
+        """
         self._log_likelihoods *= FILTER_MEMORY
         losses = np.square(errors) / variances + np.log(variances)
         self._log_likelihoods -= 0.5 * CAUTION * losses
@@ -169,7 +207,7 @@ class OutputFilter:
         self.innovation = (self.weights * errors).sum(0)
 
     def _summarise(self) -> None:
-        """Renew the means over the filters."""
+        """Compute `load`, `gain` and `gain_spread`, the means over the filters."""
         self._mean = np.einsum("fn,fni->in", self.weights, self._states)
         self.load = self._mean[LOAD]
         self.gain = np.clip(self._mean[GAIN], *GAINS)

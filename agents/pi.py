@@ -1,4 +1,4 @@
-"""Implement PI controllers: the paper's (Section 5) and better-tuned ones."""
+"""Implement PI controllers: that of Section 5 of the paper, and controllers tuned by a rule."""
 
 from __future__ import annotations
 
@@ -22,18 +22,20 @@ from agents.controller import (
 
 Array = NDArray[np.float64]
 
-# The gains of the search `benchmarks.tune pi` in version 0.1.
+# Gains Kp, t/h per degC, and Ki, t/h per degC and sample, found on the paper's plant by the
+# search `benchmarks.tune pi` in version 0.1.
 SEARCHED_GAINS = {"kp": 1.34, "ki": 0.0456}
 
 
 @dataclass(eq=False, kw_only=True)
 class PIController(Controller):
-    """PI controller u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as printed in Section 5.
+    """PI controller u(k) = -Kp e(k) - Ki sum_{i<=k} e(i), as in Section 5 of the paper.
 
-    The signs suit a plant whose output falls when its input rises, D(G) = -1. For a plant of
-    the opposite direction, both gains are negative.
+    Here u(k) is the command, t/h, and e(k) the error, set point minus output, degC. With
+    positive gains, the controller suits a plant whose output falls when its input rises. For a
+    plant whose output rises with its input, both gains must be negative.
 
-    `u_min` and `u_max` are those of `Controller`.
+    The arguments `u_min` and `u_max` are those of `Controller`.
 
     Parameters
     ----------
@@ -42,11 +44,12 @@ class PIController(Controller):
     ki
         Integral gain Ki, t/h per degC and sample.
     anti_windup
-        Whether to hold the sum while the command is beyond a limit and the error would drive it
-        further (conditional integration; Astrom and Hagglund, "PID Controllers", 2nd edition,
-        1995, section 3.5). The paper's controller always integrates.
+        Whether to stop the sum of the errors while the command is beyond a limit of the flow
+        and the error would drive the command further beyond (conditional integration; Astrom
+        and Hagglund, "PID Controllers", 2nd edition, 1995, section 3.5). The paper's controller
+        always integrates.
     error_index
-        Index of e(k), degC, in the observation.
+        Index of the error e(k), degC, in the observation.
     """
 
     kp: Number = field(default=2.2, kw_only=False)
@@ -71,8 +74,9 @@ class PIController(Controller):
     ) -> PIController:
         """Return a controller tuned by the SIMC rule, with anti-windup.
 
-        S. Skogestad, "Simple analytic rules for model reduction and PID controller tuning",
-        Journal of Process Control 13, 2003, 291-309, equations (23) and (24).
+        The SIMC rule for PI controllers is that of S. Skogestad, "Simple analytic rules for
+        model reduction and PID controller tuning", Journal of Process Control 13, 2003,
+        291-309, equations (23) and (24).
 
         Parameters
         ----------
@@ -83,11 +87,18 @@ class PIController(Controller):
         delay
             theta, the plant's delay, s.
         closed_loop_time_constant
-            tau_c, s; by default the delay, "tight control with good robustness".
+            tau_c, the wanted time constant of the closed loop, s. The default is the delay,
+            which Skogestad recommends for "tight control with good robustness".
         sampling_interval
             Sampling interval, s.
-        arguments
-            Other arguments of the controller.
+        **arguments
+            Further arguments of `PIController`, such as `u_min`.
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range, or if the delay is 0 and no
+            `closed_loop_time_constant` is given.
         """
         k = check("gain", gain, Gain)
         tau_1 = check("time_constant", time_constant, Positive)
@@ -98,33 +109,40 @@ class PIController(Controller):
             closed_loop_time_constant = theta
         tau_c = check("closed_loop_time_constant", closed_loop_time_constant, Positive)
         interval = check("sampling_interval", sampling_interval, Positive)
-        kp = -tau_1 / (k * (tau_c + theta))  # (23), with the sign of u = -Kp e
-        tau_i = min(tau_1, 4 * (tau_c + theta))  # (24)
+        # Equation (23) of Skogestad, with the sign of u = -Kp e, and equation (24).
+        kp = -tau_1 / (k * (tau_c + theta))
+        tau_i = min(tau_1, 4 * (tau_c + theta))
         return cls(kp, kp * interval / tau_i, **{"anti_windup": True, **arguments})
 
     def reset(self) -> None:
-        """Set the integral to zero."""
+        """Set the sum of the errors to zero, before a new episode."""
         super().reset()
         self._sum: Values = np.float64(0.0)  # of all errors so far
 
     def transfer(self) -> tuple[Array, Array]:
-        """Return the transfer function from e to u, valid between the limits.
+        """Return the transfer function from the error e to the command u, t/h per degC.
+
+        While the command is between the limits of the flow, the controller is linear and has
+        the transfer function -Kp - Ki / (1 - z^-1).
 
         Returns
         -------
         numerator, denominator
-            Coefficients of z^0, z^-1 and so on, of -Kp - Ki / (1 - z^-1).
+            Coefficients of z^0, z^-1 and so on, each of shape (2,).
         """
         numerator = np.array([-(self.kp + self.ki), self.kp])
         return numerator, np.array([1.0, -1.0])
 
     def _control(self, rows: Array) -> Array:
-        """Return u, t/h, and add the errors to the integral."""
+        """Return the commands u(k), t/h, shape (loops,), and add the errors to their sums.
+
+        `rows` are the observations, shape (loops, size).
+        """
         error: Array = rows[:, self.error_index]
         total = self._sum + error
         command = -self.kp * error - self.ki * total  # Section 5
         if self.anti_windup:
-            change = -self.ki * error  # of the command, through the integral
+            change = -self.ki * error  # of the command by the present error's place in the sum
             is_above = command > self.u_max
             is_below = command < self.u_min
             drives_outward = is_above & (change > 0) | is_below & (change < 0)

@@ -17,37 +17,40 @@ from agents.networks import PRETRAINED, check_array, reading
 
 Array = NDArray[np.floating[Any]]
 
-DEFAULT_FILE: Final = PRETRAINED / "neural-10000.npz"
-FORMAT: Final = 1  # of the file
+DEFAULT_FILE: Final = PRETRAINED / "neural-10000.npz"  # the network of training seed 10,000
+FORMAT: Final = 1  # version of the file format, which `load` checks
 
 
 @dataclass(frozen=True)
 class RecurrentNetwork:
-    """A gated recurrent unit, and two layers behind it that see the inputs, too.
+    """A gated recurrent unit followed by a hidden layer and an output layer.
 
-    The weights are those of `torch.nn.GRUCell` and `torch.nn.Linear`, in float32; the rows of
-    the cell belong to its reset gate, its update gate and its candidate. With `nodes` of the
-    cell and `hidden` nodes between the layers, they have the following shapes.
+    The network corrects the control law of `agents.law`. Each layer after the recurrent unit
+    also receives the network's inputs. Weights and biases are defined as those of
+    `torch.nn.GRUCell` and `torch.nn.Linear`, in float32. The rows of the recurrent unit's
+    arrays belong to its reset gate, then its update gate, then its candidate state. The number
+    of nodes in the recurrent unit is `nodes`, and that in the hidden layer is `hidden`.
     """
 
     input_weights: Array
-    """(3 nodes, INPUTS)"""
+    """Weights of the recurrent unit for the inputs, shape (3 nodes, INPUTS)."""
     input_biases: Array
-    """(3 nodes,)"""
+    """Biases of the recurrent unit for the inputs, shape (3 nodes,)."""
     state_weights: Array
-    """(3 nodes, nodes)"""
+    """Weights of the recurrent unit for its last state, shape (3 nodes, nodes)."""
     state_biases: Array
-    """(3 nodes,)"""
+    """Biases of the recurrent unit for its last state, shape (3 nodes,)."""
     hidden_weights: Array
-    """(hidden, INPUTS + nodes)"""
+    """Weights of the hidden layer for inputs and state, shape (hidden, INPUTS + nodes)."""
     hidden_biases: Array
-    """(hidden,)"""
+    """Biases of the hidden layer, shape (hidden,)."""
     output_weights: Array
-    """(OUTPUTS, hidden + INPUTS)"""
+    """Weights of the output layer for the hidden layer and the inputs, shape (OUTPUTS, hidden +
+    INPUTS)."""
     output_biases: Array
-    """(OUTPUTS,)"""
+    """Biases of the output layer, shape (OUTPUTS,)."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    """Origin of the weights, JSON-serialisable."""
+    """How the network was trained, for the network's file; JSON-serialisable."""
 
     def __post_init__(self) -> None:
         nodes, hidden = np.shape(self.state_weights)[-1], np.size(self.hidden_biases)
@@ -66,15 +69,23 @@ class RecurrentNetwork:
 
     @property
     def weights(self) -> dict[str, Array]:
-        """The arrays by name."""
+        """The arrays of weights and biases, by the names of their fields."""
         return {name: value for name, value in vars(self).items() if name != "provenance"}
 
     def initial_state(self, n: int) -> Array:
-        """Return the state of n loops at rest, shape (n, nodes)."""
+        """Return the network's state before the first sample of n loops, shape (n, nodes)."""
         return np.zeros((n, self.state_weights.shape[1]), np.float32)
 
     def step(self, inputs: Array, state: Array) -> tuple[Array, Array]:
-        """Return the outputs, shape (n, OUTPUTS), and the next state of n loops."""
+        """Return the outputs of a sample, shape (n, OUTPUTS), and the next state, (n, nodes).
+
+        Parameters
+        ----------
+        inputs
+            Inputs of n loops at this sample, as `agents.law` computes them, shape (n, INPUTS).
+        state
+            The state after the last sample, or `initial_state`, shape (n, nodes).
+        """
         from_inputs = inputs @ self.input_weights.T + self.input_biases
         from_state = state @ self.state_weights.T + self.state_biases
         reset_in, update_in, candidate_in = np.split(from_inputs, 3, axis=1)
@@ -92,7 +103,10 @@ class RecurrentNetwork:
 
     @classmethod
     def load(cls, path: str | PathLike[str] = DEFAULT_FILE) -> RecurrentNetwork:
-        """Read a network written by `save`; errors are those of `agents.networks.reading`."""
+        """Return the network in a file that was written by `save`.
+
+        A ValueError is raised if the file is damaged or holds something else.
+        """
         with reading(path, "recurrent network") as file:
             about = json.loads(str(file["about"]))
             if about["format"] != FORMAT:
@@ -102,7 +116,7 @@ class RecurrentNetwork:
             return cls(**weights, provenance=about["provenance"])
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the network to a `.npz` file."""
+        """Write the network to the `.npz` file `path`, which `load` reads."""
         about = json.dumps({"format": FORMAT, "provenance": dict(self.provenance)})
         arrays: dict[str, Any] = {**self.weights, "about": about}
         with Path(path).open("wb") as file:
@@ -110,6 +124,6 @@ class RecurrentNetwork:
 
 
 def _sigmoid(values: Array) -> Array:
-    """Return 1 / (1 + exp(-x)), without an overflow."""
+    """Return 1 / (1 + exp(-x)) for `values` x, in the same shape, without an overflow."""
     half: Array = 0.5 + 0.5 * np.tanh(0.5 * values)
     return half

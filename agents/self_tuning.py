@@ -1,4 +1,4 @@
-"""Implement controllers that identify the plant while they control it, by a bank of models."""
+"""Implement controllers that identify the plant by a bank of models, while they control it."""
 
 from __future__ import annotations
 
@@ -17,17 +17,25 @@ from agents.recurrent import RecurrentNetwork
 
 Array = NDArray[np.floating[Any]]
 
-TIME_CONSTANTS: Final = np.array([0.63, 1.0, 1.55])  # in the bank, multiples of the step test's
-# Delays in the bank where no range is given, as multiples of the step test's, and the standard
-# deviation of their prior.
+# Time constants of the bank's models, as multiples of the step test's time constant.
+TIME_CONSTANTS: Final = np.array([0.63, 1.0, 1.55])
+# If the argument `delay_range` is None: shortest and longest delay of the models, and the
+# standard deviation of the delay's prior distribution, as multiples of the step test's delay.
 DELAYS: Final = (0.33, 2.0)
 DELAY_SPREAD: Final = 0.33
-CONSTANT_SPREAD: Final = 0.3  # standard deviation of the logarithm of the time constant
-GAIN_SPREAD: Final = 0.25  # standard deviation of the gain, as a share of the step test's
-EXACT: Final = 1e-3  # the same where the gain is not estimated
-MOST_DELAYS: Final = 10_000  # in the bank; with more, it would be too large for any computer
-CLEARANCE: Final = 1e-4  # of half the range, by which float32 flows clear the dead zone
-SLOWEST: Final = 45.0  # samples, the greatest time constant that needs no slower sampling
+# Standard deviation of the natural logarithm of the time constant in the prior.
+CONSTANT_SPREAD: Final = 0.3
+# Standard deviation of the gain in the prior, as a share of the step test's gain.
+GAIN_SPREAD: Final = 0.25
+EXACT: Final = 1e-3  # the standard deviation of a gain that counts as known, of this gain
+# Greatest number of delays in a bank; a bank with more would not fit into the memory.
+MOST_DELAYS: Final = 10_000
+# Distance of the smallest flow from the dead zone, as a share of half the actuator's range:
+# enough for flows that are rounded to float32.
+CLEARANCE: Final = 1e-4
+# Time constant, samples, at twice which the controller starts to act less often. The networks
+# were trained on plants with time constants of about this length and less.
+SLOWEST: Final = 45.0
 
 
 @dataclass(eq=False, kw_only=True)
@@ -41,15 +49,16 @@ class SelfTuningController(ModelBasedController):
       of sampled stochastic processes", IEEE Transactions on Automatic Control 10, 1965,
       434-439). See `agents.bank`.
     - Kalman filters estimate the gain of the plant and the load. See `agents.output_filter`.
-    - If the set point is known to change at random, the target falls short of a set point that
-      may change before a flow shows. See `agents.hedge`.
-    - As in a Smith predictor, the mean model predicts the response to flows in transit, and the
-      flow moves the predicted output to the target. See `agents.law`.
+    - If the set point is known to change at random, the target for the output lies between the
+      set point and 0, as the set point may change before a flow shows. See `agents.hedge`.
+    - As in a Smith predictor, the mean of the models predicts the effect of flows that have not
+      yet shown in the output, and the next flow moves the predicted output to the target. See
+      `agents.law`.
 
-    A command is 0 or outside the dead zone, so the models know the flow that passes. All
-    quantities are scaled, so the controller serves plants of either sign, with any limits and
-    any sampling interval. If the time constant is 90 samples or more, the controller acts at
-    every second sample or less often.
+    A command is 0 or outside the dead zone, so the flow that passes the actuator is known to
+    the models. All quantities are scaled, so the controller suits plants with a gain of either
+    sign, with any limits and any sampling interval. If the time constant is 90 samples or more,
+    the controller changes the command at every second sample or less often.
 
     The other parameters are those of `ModelBasedController`.
 
@@ -68,9 +77,10 @@ class SelfTuningController(ModelBasedController):
         point.
     setpoint_amplitude
         Greatest level of a random set point, degC. The levels are uniformly distributed between
-        `-setpoint_amplitude` and `setpoint_amplitude`. It needs `setpoint_holds`.
+        `-setpoint_amplitude` and `setpoint_amplitude`. Without `setpoint_holds`, the argument
+        `setpoint_amplitude` has no effect.
     setpoint_index, error_index
-        Indices of y_d(k) and e(k), degC, in the observation.
+        Indices of the set point y_d(k) and of the error e(k), both in degC, in the observation.
     """
 
     delay_range: tuple[float, float] | None = None
@@ -83,7 +93,8 @@ class SelfTuningController(ModelBasedController):
         super().__post_init__()
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
         self._edge = self.dead_zone
-        # A slow plant is sampled less often, so that it looks like those of the training.
+        # The controller acts less often on a slow plant, so that in units of its own interval
+        # the plant looks like the plants on which the networks were trained.
         constant = self.time_constant / self.sampling_interval
         self._every = max(1, int(constant / SLOWEST))
         self._constant = constant / self._every
@@ -92,7 +103,12 @@ class SelfTuningController(ModelBasedController):
         self._delays, self._log_probabilities = self._delay_prior()
 
     def _delay_prior(self) -> tuple[NDArray[np.intp], Array]:
-        """Return the delays d of the bank, samples, and the logs of their probabilities."""
+        """Return the delays of the bank's models and the logarithms of their probabilities.
+
+        The constructor calls this method. A delay is the d of equation (28) of the paper, in
+        intervals at which the controller acts. The logarithms are those of the prior, up to a
+        constant. Both arrays have the shape (delays,).
+        """
         interval = self.sampling_interval * self._every
         likely = self.delay / interval
         shortest, longest = DELAYS[0] * likely, DELAYS[1] * likely
@@ -114,10 +130,10 @@ class SelfTuningController(ModelBasedController):
 
     @property
     def estimates(self) -> dict[str, Array]:
-        """Estimates of the plants, means over the models, each of shape (batch,).
+        """The present estimates of the plants' parameters by name, each of shape (batch,).
 
-        `gain` (degC per t/h), `time_constant` (s) and `delay` (s, as in the constructor). Empty
-        before the first observation.
+        The names are `gain` (degC per t/h), `time_constant` (s) and `delay` (s, defined as the
+        argument `delay`). Before the first observation of an episode, the dict is empty.
         """
         if self._k == 0:
             return {}
@@ -129,12 +145,12 @@ class SelfTuningController(ModelBasedController):
         }
 
     def reset(self) -> None:
-        """Forget the episode and the identified plant, as the next plant may be different."""
+        """Forget past samples and the identified plant, as the next plant may be different."""
         super().reset()
         self._k = 0
 
     def _prior(self, n: int) -> Prior:
-        """Return what is known of n plants from the step test."""
+        """Return what the step test tells of n plants: the bank's models and probabilities."""
         constants = (self._constant * TIME_CONSTANTS)[:, np.newaxis]
         of_constants = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
         logarithms = self._log_probabilities[:, np.newaxis] + of_constants
@@ -146,7 +162,10 @@ class SelfTuningController(ModelBasedController):
         )
 
     def _start(self, n: int) -> None:
-        """Begin to control n plants at rest."""
+        """Make the bank, the observer and the control law for n plants at rest.
+
+        `_control` calls this method at the first sample of an episode.
+        """
         edge = 0.0
         if self.dead_zone > 0.0:
             edge = self.dead_zone / abs(self._unit_flow) + CLEARANCE
@@ -158,6 +177,11 @@ class SelfTuningController(ModelBasedController):
         self._law = Law(self._bank, edges, limits)
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the commands u(k), t/h, shape (loops,), and update the identified models.
+
+        `rows` are the observations, shape (loops, size). If the plant is slow, most calls
+        repeat the last command.
+        """
         if self._k == 0:
             self._start(len(rows))
         if self._k % self._every == 0:
@@ -174,7 +198,11 @@ class SelfTuningController(ModelBasedController):
         return command
 
     def _random_setpoint(self) -> RandomSetpoint | None:
-        """Return how the set point changes at random, in samples and of the authority."""
+        """Return the distribution of the set point, scaled; None if it is not known.
+
+        Times are in intervals at which the controller acts, and the amplitude is a share of the
+        authority. A ValueError is raised if `setpoint_holds` is not a valid range.
+        """
         if self.setpoint_holds is None:
             return None
         limits = _check_range("setpoint_holds", self.setpoint_holds)
@@ -182,12 +210,16 @@ class SelfTuningController(ModelBasedController):
         return RandomSetpoint(shortest, longest, self.setpoint_amplitude / abs(self._authority))
 
     def _network(self) -> Network | None:
-        """Return the network that corrects the control law; None, as there is none."""
+        """Return the network that corrects the control law; None in this class."""
         return None
 
 
 def _check_range(name: str, limits: Any) -> tuple[float, float]:
-    """Return the limits of a range of times, s, if they are valid; otherwise a ValueError."""
+    """Return the shortest and the longest time of a range, s, as floats.
+
+    A ValueError, which names the argument `name`, is raised unless `limits` are two finite
+    numbers of at least 0, the shortest time first.
+    """
     try:
         shortest, longest = map(float, limits)
     except (TypeError, ValueError):
@@ -204,43 +236,49 @@ def _check_range(name: str, limits: Any) -> tuple[float, float]:
 class NeuralSelfTuningController(SelfTuningController):
     """A self-tuning controller whose control law is corrected by a trained recurrent network.
 
-    The network was trained once, on many simulated plants, and does not learn online. The
-    network is computed in float32, so a loop in a batch can differ from a single loop by
-    rounding. The parameters are those of `SelfTuningController` and the following.
+    The network was trained in advance, on many simulated plants, and does not learn online. The
+    network is computed in float32, so the commands of a loop in a batch can differ by rounding
+    from those of a single loop. The other parameters are those of `SelfTuningController`.
 
     Parameters
     ----------
     network
-        The weights; by default those that come with the project.
+        The trained network; by default the network in the folder `agents/pretrained`.
     """
 
     network: RecurrentNetwork = field(default_factory=RecurrentNetwork.load, repr=False)
 
     def _start(self, n: int) -> None:
+        """Make the parts of the control law, and the network's state, for n plants at rest."""
         super()._start(n)
         self._state = self.network.initial_state(n)
 
     def _network(self) -> Network:
-        """Return the network as a function of its inputs, which keeps its state."""
+        """Return the function that computes the network's outputs and keeps its state."""
         return self._outputs
 
     def _outputs(self, inputs: Array) -> Array:
-        """Return the network's outputs, shape (n, OUTPUTS), and keep its next state."""
+        """Return the network's outputs, shape (n, OUTPUTS), and store its next state.
+
+        `inputs` are the inputs of a sample, shape (n, INPUTS), so call this once per sample.
+        """
         outputs, self._state = self.network.step(inputs, self._state)
         return outputs
 
 
 @dataclass(eq=False, kw_only=True)
 class NeuralSmithPredictor(NeuralSelfTuningController):
-    """A neural controller that trusts a step test, in place of identifying the plant.
+    """A neural controller that trusts a step test, and does not identify the plant.
 
-    It is a `NeuralSelfTuningController` with a single model, that of the step test, and a known
-    gain. It has the same parameters, except `delay_range`.
+    The controller is a `NeuralSelfTuningController` whose bank has a single model, that of the
+    step test, and whose gain counts as known. The parameters are those of
+    `NeuralSelfTuningController`, without `delay_range`.
     """
 
     delay_range: None = field(init=False, default=None)
 
     def _prior(self, n: int) -> Prior:
+        """Return a prior with a single model of each of n plants, that of the step test."""
         samples = self.delay / (self.sampling_interval * self._every)
         return Prior(
             time_constants=np.full((1, n), self._constant),

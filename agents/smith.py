@@ -19,29 +19,37 @@ Array = NDArray[np.float64]
 class SmithPredictor(InternalModelController):
     """A PI controller on the error that an undelayed model of the plant predicts.
 
-    A first-order model with a delay runs in parallel with the plant. Its undelayed output minus
-    its delayed output is the effect of the inputs that are still in transit. The controller
-    acts on the error minus this effect. As far as the model is right, it acts as if there were
-    no delay (O. J. M. Smith, "Closer control of loops with dead time", Chemical Engineering
-    Progress 53, 1957, 217-219).
+    A first-order model with a delay runs in parallel with the plant. The model's undelayed
+    output minus the model's delayed output is the effect of flows that have not yet shown in
+    the plant's output. The PI controller acts on the error minus the effect of these flows. If
+    the model is right, the PI controller acts as if the plant had no delay (O. J. M. Smith,
+    "Closer control of loops with dead time", Chemical Engineering Progress 53, 1957, 217-219).
 
-    The gains `kp` and `ki` follow from the SIMC rule for the plant without delay. The input of
-    the model is the flow that the actuator passes. A command inside the dead zone is moved to 0
-    or to the edge of the dead zone, whichever is nearer.
+    The gains `kp` and `ki` follow from the SIMC rule for the plant without delay (see
+    `PIController.simc`). The input of the model is the flow that the actuator passes. A command
+    inside the dead zone is moved to 0 or to the edge of the dead zone, whichever is nearer.
 
-    To prevent windup, the integral follows the wanted flow, limited to the actuator's range,
-    with the time constant of the integral action (K. J. Astrom and T. Hagglund, "PID
-    Controllers", 2nd edition, 1995, section 3.5). As long as no limit is active, this is the
-    usual PI controller. While the wanted flow is inside the dead zone, the integral goes on.
+    To prevent windup, the integral part of the command follows the wanted flow, limited to the
+    actuator's range, with the time constant of the integral action (K. J. Astrom and T.
+    Hagglund, "PID Controllers", 2nd edition, 1995, section 3.5). As long as no limit of the
+    flow is active, the controller with anti-windup equals an ordinary PI controller. While the
+    wanted flow is inside the dead zone, the controller goes on integrating.
 
     The other parameters are those of `ModelBasedController`.
 
     Parameters
     ----------
     closed_loop_time_constant
-        Time constant of the closed loop without the delay, s.
+        Time constant that the closed loop would have if the plant had no delay, s.
     error_index
-        Index of e(k), degC, in the observation.
+        Index of the error e(k), degC, in the observation.
+
+    Attributes
+    ----------
+    kp : float
+        Proportional gain of the PI controller, t/h per degC.
+    ki : float
+        Integral gain of the PI controller, t/h per degC and sample.
     """
 
     closed_loop_time_constant: Positive
@@ -61,15 +69,21 @@ class SmithPredictor(InternalModelController):
         self.n_obs = self.error_index + 1
 
     def reset(self) -> None:
-        """Set the integral to zero, and return the model to rest."""
+        """Set the integral to zero and the model's outputs to 0, before a new episode."""
         super().reset()
         self._integral: Values = np.float64(0.0)  # -Ki times the sum of past errors, t/h
 
     def transfer(self) -> tuple[Array, Array]:
-        """Return the transfer function from e to u, valid away from limits and dead zone.
+        """Return the transfer function from the error e to the command u, t/h per degC.
 
-        It is that of the PI controller with the undelayed minus the delayed model fed back
-        around it, in the coefficients of `PIController.transfer`.
+        The Smith predictor is linear while the command is between the limits of the flow and
+        outside the dead zone. Its transfer function is that of the PI controller with a
+        feedback: the undelayed model minus the delayed model.
+
+        Returns
+        -------
+        numerator, denominator
+            Coefficients of z^0, z^-1 and so on.
         """
         pi, integral = PIController(self.kp, self.ki).transfer()
         model = np.array([0.0, self._input_gain]), np.array([1.0, -self._pole])
@@ -81,6 +95,10 @@ class SmithPredictor(InternalModelController):
         return np.convolve(pi, model[1]), polyadd(outgoing, returning)
 
     def _control(self, rows: Array) -> Array:
+        """Return the commands u(k), t/h, shape (loops,), and advance the model by a sample.
+
+        `rows` are the observations, shape (loops, size).
+        """
         in_transit = self._undelayed - self._delayed
         error = rows[:, self.error_index] - in_transit
         gain = self.kp + self.ki  # the sum includes the present error

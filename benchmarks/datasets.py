@@ -18,18 +18,20 @@ from benchmarks.lib.storage import out_folder
 from mptc_gym import PRESETS, evaluate
 from mptc_gym.scoring.rollout import rollout
 
-SAMPLES = 1200  # in an episode
-EPISODES = 100  # in a data set
-SEED = SEEDS["data sets"].first  # of the first episode
-EVALUATIONS = 50  # episodes to evaluate learners on, none of which is in the data
-# Names of the controllers of a data set, which take turns, episode by episode.
+SAMPLES = 1200  # length of an episode
+EPISODES = 100  # default number of episodes in a data set
+SEED = SEEDS["data sets"].first  # seed of the first episode of each data set
+EVALUATIONS = 50  # number of episodes to evaluate learners on; none of them is in the data
+# The controllers that collect the episodes of a data set, by the data set's behaviour. Several
+# controllers take turns, episode by episode.
 BEHAVIOURS = {
     "pi": ("pi",),
     "smith": ("smith",),
     "mixed": ("pi", "pi-simc", "smith", "nn"),
 }
-# A data set gets a new version when its content changes. In v1 the Smith predictor has another
-# anti-windup than in v0, and the Smith predictor and PI (SIMC) are tuned to an Ms of 1.6.
+# The version of each data set, which rises when the content changes. Since version 1, the Smith
+# predictor has another anti-windup, and the Smith predictor and the PI controller `pi-simc` are
+# tuned to an Ms (largest magnitude of the sensitivity function) of 1.6.
 VERSIONS = {"pi": 0, "smith": 1, "mixed": 1}
 IDS = {
     f"middlepoint/{plant}/{behaviour}-v{VERSIONS[behaviour]}": (plant, behaviour)
@@ -42,10 +44,10 @@ HOME = "~/.minari/datasets"  # Minari's folder if this variable is not set
 
 @dataclass(frozen=True)
 class Episode:
-    """A logged episode of N samples."""
+    """A logged episode of N samples of a plant under a controller."""
 
-    controller: str
-    seed: int
+    controller: str  # name of the controller
+    seed: int  # seed of the environment's reset
     observations: NDArray[np.float32]  # shape (N + 1, size)
     actions: NDArray[np.float32]  # within [-1, 1], shape (N, 1)
     rewards: NDArray[np.float64]  # -|e(k+1)|, degC, shape (N,)
@@ -66,7 +68,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Write data sets, and print the mean errors of each."""
+    """Write data sets, print the mean errors of each, and return the closing message."""
     root = out_folder(Path(os.environ.get(VARIABLE) or HOME).expanduser().absolute(), VARIABLE)
     for name in dict.fromkeys(options.ids or IDS):
         print(f"{name}: {write(root, name, options.episodes)}", flush=True)
@@ -74,20 +76,32 @@ def work(options: Options) -> str:
 
 
 def arguments_of(plant: str) -> dict[str, Any]:
-    """Return the arguments of the environment that a plant's data sets come from."""
+    """Return the arguments of the environment in which the data sets of a plant are collected.
+
+    `plant` is the name of a preset.
+    """
     return {
         **PRESETS[plant],
         "setpoint": "random",
-        "reward": "absolute",  # with this scale, -|e|
+        "reward": "absolute",  # with `error_scale`, the reward is -|e|, degC
         "error_scale": 1.0,
-        "action_window": 20,  # which makes the problem Markov while the set point holds
+        # More past actions than the delay: the observation then determines the next output,
+        # apart from noise and changes of the set point.
+        "action_window": 20,
     }
 
 
 def record(plant: str, behaviour: str, episodes: int = EPISODES) -> list[Episode]:
-    """Return episodes of a plant under the controllers of one of `BEHAVIOURS`.
+    """Return logged episodes of a plant under some controllers, which take turns.
 
-    The controllers take turns. Episode i has the seed `SEED + i`.
+    Parameters
+    ----------
+    plant
+        Name of a preset.
+    behaviour
+        Key of `BEHAVIOURS`, which has the names of the controllers.
+    episodes
+        Number of episodes. Episode i has the seed `SEED + i`.
     """
     names = BEHAVIOURS[behaviour][:episodes]
     recorded: list[Episode] = []
@@ -98,7 +112,11 @@ def record(plant: str, behaviour: str, episodes: int = EPISODES) -> list[Episode
 
 
 def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]:
-    """Return one episode of a plant under a controller for each seed, all run side by side."""
+    """Return a logged episode of a plant under a controller for each seed.
+
+    The plants of all seeds are stepped together. `plant` is the name of a preset, and `name`
+    the name of a controller.
+    """
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.loop.rollout import make_plants
 
@@ -108,7 +126,10 @@ def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]
     actions: list[NDArray[np.float32]] = []  # of each sample, shape (episodes, 1)
 
     def act(observations: Any) -> NDArray[np.float32]:
-        # Beyond +-1 the actuator saturates: clipping does not change what the plant does.
+        """Return the controller's actions, clipped to [-1, 1], and log them.
+
+        The actuator saturates beyond +-1, so the clipping does not change the plant's output.
+        """
         actions.append(np.clip(controller.act(observations), -1.0, 1.0).astype(np.float32))
         return actions[-1]
 
@@ -124,18 +145,27 @@ def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]
 
 
 def write(root: Path, name: str, episodes: int) -> str:
-    """Write a complete data set or none, replacing the data set of this id.
+    """Collect a data set, write it to Minari's folder, and return its mean errors as text.
 
-    `root` is Minari's folder. The mean errors are returned as text. An `UnfinishedError` is
-    raised if the files cannot be written.
+    The data set replaces an older data set of the same id. If the files cannot be written, an
+    `UnfinishedError` is raised, and no incomplete data set remains.
+
+    Parameters
+    ----------
+    root
+        Minari's folder.
+    name
+        The id of the data set, a key of `IDS`.
+    episodes
+        Number of episodes to collect.
     """
     place = root / name
     logged = record(*IDS[name], episodes)
     try:
         # Minari does not list the contents of hidden folders.
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
-            # HDF5 crashes where a disk is full. So a file as large as a data set is written
-            # before, and removed.
+            # HDF5 crashes if the disk is full. A file as large as the data set is written and
+            # removed first: on a full disk, this raises an OSError.
             room = Path(partial, "room")
             room.write_bytes(bytes(1_000_000 + episodes * 250_000))
             room.unlink()
@@ -152,7 +182,11 @@ def write(root: Path, name: str, episodes: int) -> str:
 
 
 def _create(name: str, episodes: list[Episode]) -> str:
-    """Write a data set to Minari's folder, and return its mean errors as text."""
+    """Write logged episodes as a data set to Minari's folder; return mean errors as text.
+
+    Minari takes its folder from the environment variable `VARIABLE`. `name` is the id of the
+    data set, a key of `IDS`.
+    """
     import minari
     from minari.data_collector import EpisodeBuffer
 

@@ -1,4 +1,4 @@
-"""Compare the linear rules at one robustness: `python -m benchmarks.robustness --help`."""
+"""Compare linear controllers of equal robustness: `python -m benchmarks.robustness --help`."""
 
 from __future__ import annotations
 
@@ -20,14 +20,18 @@ from mptc_gym.evaluation import SEED
 if TYPE_CHECKING:
     import pandas as pd
 
+# Controllers with a tuning rule that has a single parameter, a time constant.
 RULES = [name for name, spec in ROSTER.items() if spec.tuned_by]
-CASES = "square", "square-noise", "constant", "load"
-PANELS = {  # of the picture: cases and titles
+CASES = "square", "square-noise", "constant", "load"  # names of scenarios
+# The panels of the picture: a case, and the title of its panel.
+PANELS = {
     "square-noise": "square wave with noise, R = 0.5 °C²",
     "load": "load steps at a held set point",
 }
-SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3  # values of Ms
-TICKS = 200, 500, 1000, 2000, 5000  # of the valve travel in noise, t/h
+# Values of Ms, the largest magnitude of the loop's sensitivity function: the lower, the more
+# robust is the loop. `ROBUSTNESS` is the Ms at which controllers are compared.
+SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3
+TICKS = 200, 500, 1000, 2000, 5000  # ticks of the axis of valve travel in noise, t/h
 TEXT = (
     "Each tuning rule has one free time constant. In the table, the time constant is chosen "
     f"such that the loop has a maximum sensitivity Ms of {ROBUSTNESS:g} on the paper's plant, "
@@ -50,7 +54,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run the rules, and write the table, the picture and all numbers."""
+    """Run all controllers, write report, picture and data, and return the closing message."""
     import pandas as pd
 
     from benchmarks.lib.report import Section, write_report
@@ -77,17 +81,32 @@ def work(options: Options) -> str:
 
 
 def lowest(scenario: Scenario) -> float:
-    """Return the least possible mean error of a case, degC."""
+    """Return the least possible mean error of a scenario, degC."""
     from benchmarks.bounds.least import least_possible
 
     return least_possible(samples=scenario.samples, **scenario.arguments).value
 
 
 def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
-    """Return a row for each case: the results of a rule that is tuned to an Ms.
+    """Run a controller that is tuned to an Ms, and return a row of results for each case.
 
-    A row has the name of the rule, its Ms and time constant, s, the range of stable delays,
-    samples, the case, and means over the runs: the error, degC, and the valve travel, t/h.
+    Parameters
+    ----------
+    name
+        Name of the controller, one of `RULES`.
+    sensitivity
+        The Ms to which the controller is tuned on the paper's plant: the largest magnitude of
+        the loop's sensitivity function.
+    runs
+        Runs of each case with noise or load; a case without has one run.
+
+    Returns
+    -------
+    list of dict
+        A row has `agent`, the name of the controller; `Ms`; the time constant of the tuning
+        rule, s, by its name; `shortest_delay` and `longest_delay`, samples, between which the
+        loop is stable; `case`; and the means over the runs of the mean error, `mean_error`,
+        degC, and of the valve travel, `travel`, t/h.
     """
     spec = replace(ROSTER[name], sensitivity=sensitivity)
     shortest, longest = spec.loop({}).stable_delays() or (None, None)
@@ -113,9 +132,11 @@ def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
 
 
 def overview(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the table of the report, as text: a row for each rule, a column for each case.
+    """Return the report's table as text, with a row for each controller of `RULES`.
 
-    `rows` are those of `run_rule` at one Ms, with the column `ratio`.
+    `rows` are the rows of `run_rule` at a single Ms, with an additional column `ratio`, the
+    mean error divided by the least possible error. The report's table has a column of ratios
+    for each case.
     """
     import pandas as pd
 
@@ -137,7 +158,12 @@ def overview(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def finding(rows: pd.DataFrame) -> str:
-    """Return the title of the picture: what the rules do in noise at one robustness."""
+    """Return the picture's title, which compares errors and valve travels in noise.
+
+    `rows` are the rows of `run_rule` for all controllers and Ms, with the column `ratio`, the
+    mean error divided by the least possible error. The title compares, at an Ms of
+    `ROBUSTNESS`, the controllers with the least and with the most valve travel.
+    """
     noisy = rows[(rows["Ms"] == ROBUSTNESS) & (rows["case"] == "square-noise")]
     ordered = noisy.sort_values("travel")
     least, most = ordered.iloc[0], ordered.iloc[-1]
@@ -150,9 +176,10 @@ def finding(rows: pd.DataFrame) -> str:
 
 
 def draw(rows: pd.DataFrame, path: Path) -> None:
-    """Draw error ratio over valve travel, a panel for each case of `PANELS`.
+    """Draw error ratios over valve travel, and write the picture to the file `path`.
 
-    `rows` are those of `run_rule`, with the column `ratio`.
+    `rows` are the rows of `run_rule` for all controllers and Ms, with the column `ratio`, the
+    mean error divided by the least possible error. Each case of `PANELS` has a panel.
     """
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator, NullLocator
@@ -179,7 +206,19 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
 
 
 def _draw_rule(panel: Any, rows: pd.DataFrame, name: str) -> None:
-    """Draw the line of a rule, with the Ms at its ends and a large mark at `ROBUSTNESS`."""
+    """Draw a controller's line of error ratio over valve travel in a panel.
+
+    The line is labelled with the Ms at both ends, and has a large mark at the Ms `ROBUSTNESS`.
+
+    Parameters
+    ----------
+    panel
+        Axes of Matplotlib.
+    rows
+        The controller's rows of one case, in the order of Ms.
+    name
+        Name of the controller.
+    """
     colour, marker = ROSTER[name].look
     style: Any = {"color": colour, "marker": marker}
     panel.plot(rows["travel"], rows["ratio"], **style, markersize=4, label=label(name))

@@ -13,19 +13,21 @@ import numpy as np
 from benchmarks.lib.command import Runs, blame, command, options
 from mptc_gym import PRESETS
 
-EPISODE = 1200  # steps
-BATCHES = (1, 8, 64, 1024, 16384)
-ON_DEVICE = tuple(4**power for power in range(5, 12))  # 1,024 to 4,194,304 plants
+EPISODE = 1200  # steps in an episode of the plant
+BATCHES = (1, 8, 64, 1024, 16384)  # numbers of plants that are stepped together
+# Numbers of plants with the option --device: 1,024 to 4,194,304.
+ON_DEVICE = tuple(4**power for power in range(5, 12))
 REFERENCE, PLANT = "CartPole-v1", "MiddlePoint-v0"
-# Arguments of the measured plants, by the end of their names in the table.
+# Arguments of the environment for the measured plants. The keys are the ends of the plants'
+# names in the table.
 PLANTS: dict[str, Any] = {"": {}, ", R = 0.5": PRESETS["noisy"], ", hard": PRESETS["hard"]}
 
 
 class Case(NamedTuple):
-    """What is timed: a function, and the number of steps that it makes."""
+    """A function to time, and the number of steps that the function makes."""
 
-    run: Callable[[], object]
-    steps: int
+    run: Callable[[], object]  # the function
+    steps: int  # steps in a call of the function, summed over all plants
 
 
 @options
@@ -43,7 +45,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Measure, print the tables and return the closing line."""
+    """Measure speeds, print a table for each number of plants, and return the closing line."""
     from benchmarks.lib.report import on_screen
 
     numbers_of_plants = ON_DEVICE if options.device else BATCHES
@@ -56,10 +58,11 @@ def work(options: Options) -> str:
 
 
 def make_environments(n: int, device: str | None) -> dict[str, Any]:
-    """Return environments with n plants by their names in the table.
+    """Return the environments to measure with n plants each, by their names in the table.
 
-    Without a device, these are CartPole and the plants in NumPy and, if PyTorch is installed,
-    in PyTorch. With a device, these are the plants in PyTorch alone.
+    If `device` is None, the environments are CartPole, the plants in NumPy and, if PyTorch is
+    installed and n is above 1, the plants in PyTorch on the CPU. Otherwise, the environments
+    are the plants in PyTorch on the device with this name, such as "cuda".
     """
     if n == 1:
         return {name: gymnasium.make(name) for name in (REFERENCE, PLANT)}
@@ -82,11 +85,17 @@ def make_environments(n: int, device: str | None) -> dict[str, Any]:
 
 
 def stepping(envs: Any) -> Case:
-    """Return a case that steps one environment, or a vector environment, and resets it.
+    """Return a case that steps an environment with random actions.
 
-    A single environment is stepped for ten episodes of the plant, and reset after each of its
-    episodes; a vector environment resets itself. The function of the case returns when the
-    device has finished.
+    A single environment is stepped for ten times the length of the plant's episode, and reset
+    at the end of each of its own episodes. A vector environment is stepped for one episode of
+    the plant, and resets itself. If the environment runs on a device, the function of the case
+    waits until the device has finished all steps.
+
+    Parameters
+    ----------
+    envs
+        A Gymnasium environment, a Gymnasium vector environment, or a `MiddlePointTorchEnv`.
     """
     is_single = isinstance(envs, gymnasium.Env)
     if is_single:
@@ -107,6 +116,7 @@ def stepping(envs: Any) -> Case:
         actions = [torch.as_tensor(action, device=device) for action in actions]
 
     def run() -> None:
+        """Make all steps of the case."""
         for k in range(steps):
             _, _, terminated, truncated, _ = envs.step(actions[k % len(actions)])
             if is_single and (terminated or truncated):
@@ -119,10 +129,11 @@ def stepping(envs: Any) -> Case:
 
 
 def compare(cases: Mapping[str, Case], rounds: int) -> Any:
-    """Time cases in turns for some rounds, and return a table of text with a row for each case.
+    """Time cases for some rounds, and return a data frame of text with a row for each case.
 
-    The ratio compares the steps a second of a case with those of the first case in the same
-    round.
+    In a round, each case is timed once. A row has the median over rounds of the steps per
+    second, and the ratio to the first case: the median of the quotients of the steps per second
+    in the same round, with the 10th and the 90th percentile in parentheses.
     """
     import pandas as pd  # here, as in all commands: it would slow the help down
 

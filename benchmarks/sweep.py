@@ -29,12 +29,15 @@ from mptc_gym import Parameters
 if TYPE_CHECKING:
     import pandas as pd
 
-SAMPLES = 1200  # of a run
+SAMPLES = 1200  # length of a run
 SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
-SEED = SEEDS["studies"].first  # of a plant's first run, and of the bootstraps
-PLANTS = 200  # in a random design by default
-OSCILLATES = 1.0  # degC by which the swing must exceed the swing with an idle valve
-COLUMNS = {  # of the overview: headings and formats
+SEED = SEEDS["studies"].first  # seed of the first run on each plant, and of the bootstraps
+PLANTS = 200  # default number of plants in a random design
+# A run oscillates if the standard deviation of its error on steady stretches exceeds that of an
+# idle valve by this number, degC.
+OSCILLATES = 1.0
+# Headings and number formats of the report's table, by the names of columns of `summarise`.
+COLUMNS = {
     "multiple": ("error ratio, median", "{:.3f}"),
     "multiple_p90": ("error ratio, 90 %", "{:.3f}"),
     "travel": ("travel (t/h)", "{:,.0f}"),
@@ -50,8 +53,9 @@ TEXT = (
     "runs."
 )
 PICTURE = "The error of each controller on each plant, relative to the least possible error"
-# Groups of the plants of a random design, by a condition on their arguments. The delays of
-# plants that drift make three groups of about equal size.
+# Groups of plants in a random design: a name, and a condition on the plants' arguments for
+# `DataFrame.query`. The ends of the delays divide the drifting plants into three groups of
+# about equal size.
 GROUPS = {
     "no drift": "gain_drift.isna()",
     "all that drift": "gain_drift > 0",
@@ -59,7 +63,8 @@ GROUPS = {
     "delay from 14 to 22 samples": "gain_drift > 0 and 14 <= delay <= 22",
     "delay above 22 samples": "gain_drift > 0 and delay > 22",
 }
-# Questions about pairs of controllers: does the first have the smaller error?
+# Questions of the report, with pairs of controllers: is the error of the first controller in a
+# pair smaller than that of the second?
 QUESTIONS = {
     "Does online learning help when the plant drifts?": (
         ("nn", "pi-simc"),
@@ -103,7 +108,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run the sweep and write its results.
+    """Run the sweep, write its report and data, and return the closing message for users.
 
     After an error or an interruption, the results that have finished are written.
     """
@@ -134,9 +139,10 @@ def work(options: Options) -> str:
 
 
 def design(options: Options, nominal: Arguments) -> list[Arguments]:
-    """Return the arguments in which the plants of the design differ from the nominal plant.
+    """Return, for each plant of the design, the arguments that differ from the nominal plant.
 
-    A `UsageError` is raised if options contradict each other, or if a plant is invalid.
+    `nominal` holds the arguments of the environment for the plant that the controllers are made
+    for. A `UsageError` is raised if options contradict each other, or if a plant is invalid.
     """
     gains = np.linspace(0.75, 1.65, 10).round(6).tolist()
     plants: list[Arguments] = [
@@ -159,7 +165,23 @@ def tasks_of(
     nominal: Arguments,
     plants: Sequence[Arguments],
 ) -> dict[str, Any]:
-    """Return the tasks by name: "plant 0" for an idle valve, "plant 0, nn" for a controller."""
+    """Return the runs of the sweep as functions without arguments, by name.
+
+    The name is "plant 0" for the idle valve on the first plant, and "plant 0, nn" for the
+    controller `nn` on the same plant.
+
+    Parameters
+    ----------
+    options
+        The options of the command.
+    controllers
+        The controllers by name. A controller can have several members, such as networks that
+        were trained from different seeds.
+    nominal
+        Arguments of the environment for the plant that the controllers are made for.
+    plants
+        For each plant, the arguments that differ from the nominal plant.
+    """
     members = {name: controller.members() for name, controller in controllers.items()}
     ranges = ranges_of(plants)
     tasks: dict[str, Any] = {}
@@ -167,7 +189,8 @@ def tasks_of(
         case = {**nominal, **plant, **SETPOINT}
         tasks[f"plant {i}"] = partial(run_idle_valve, case, options.runs)
         for name, members_of_controller in members.items():
-            # The plants take the members in turn, so that maps show how much members differ.
+            # Each plant gets the next member of a controller, so that a map over the plants
+            # shows how much the members differ.
             member = members_of_controller[i % len(members_of_controller)]
             prior = {**nominal, **SETPOINT}
             if "delay_range" in member.prior_knowledge:
@@ -179,7 +202,10 @@ def tasks_of(
 
 
 def ranges_of(plants: Sequence[Arguments]) -> Arguments:
-    """Return the ranges [lowest, highest] of delay and dead zone in a design, if they vary."""
+    """Return the ranges [lowest, highest] of `delay` and `dead_zone` over the plants.
+
+    An argument that is the same for all plants is left out.
+    """
     ranges: Arguments = {}
     for name in ("delay", "dead_zone"):
         values = [plant[name] for plant in plants if name in plant]
@@ -191,10 +217,24 @@ def ranges_of(plants: Sequence[Arguments]) -> Arguments:
 def run_agent(
     controller: ControllerSpec, prior: Arguments, case: Arguments, runs: int
 ) -> dict[str, Any]:
-    """Run a controller on a plant, and return its measures, each of shape (runs,).
+    """Run a controller on a plant, and return measures of the runs, each of shape (runs,).
 
-    `prior` are the arguments of the plant for which the controller is made, and `case` the
-    arguments of the plant on which it runs. The measures are those of `measure`, and `swing`.
+    Parameters
+    ----------
+    controller
+        The controller.
+    prior
+        Arguments of the environment for the plant that the controller is made for.
+    case
+        Arguments of the environment for the plant on which the controller runs.
+    runs
+        Number of runs.
+
+    Returns
+    -------
+    dict
+        `run`, the number of the run; the measures of `benchmarks.loop.rollout.measure` by name;
+        and `swing`, degC, the result of the function `swing`.
     """
     agent = controller.in_service(prior, runs, SEED)
     trajectory = controller.run(case, SAMPLES, runs, SEED, agent)
@@ -205,7 +245,8 @@ def run_agent(
 def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
     """Run an idle valve on a plant, and return its measures and the least possible error.
 
-    The measures are those of `run_agent`. The error, `limit`, degC, is the reference; it is NaN
+    `case` holds the plant's arguments of the environment. The measures are those of
+    `run_agent`. The least possible error, `limit`, degC, is of the kind "reference"; it is NaN
     if the plant does not settle between changes of the set point.
     """
     from benchmarks.bounds.least import least_possible
@@ -220,8 +261,8 @@ def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
     """Return the standard deviation of the error on steady stretches, degC, shape (runs,).
 
-    Steady stretches are the second halves of the stretches of constant set point. The variances
-    of all steady stretches are averaged.
+    Between two changes of the set point, the second half of the samples is a steady stretch.
+    The variance of the error is averaged over all steady stretches of a run.
     """
     errors = trajectory.setpoint - trajectory.output
     variances = [
@@ -234,11 +275,21 @@ def swing(trajectory: Trajectory) -> NDArray[np.float64]:
 def table(
     plants: Sequence[Arguments], agents: Sequence[str], results: Mapping[str, Any]
 ) -> pd.DataFrame:
-    """Return a row for each run that has finished; without any, the table is empty.
+    """Return a table with a row for each run that has finished.
 
-    A row has the number and the arguments of the plant, the name of the controller, its
-    measures, and comparisons with an idle valve in the same noise. `results` are those of the
-    tasks of `tasks_of`, by name.
+    A row has the number and the arguments of the plant, the name of the controller, the
+    measures of `run_agent`, and comparisons with an idle valve in the same noise: `limit`, the
+    least possible error, degC; `ratio`, the mean error divided by `limit`; and whether the run
+    `oscillates` and is `useless`, no better than an idle valve.
+
+    Parameters
+    ----------
+    plants
+        For each plant, the arguments that differ from the nominal plant.
+    agents
+        The names of the controllers.
+    results
+        The results of the tasks that have finished, by the names of `tasks_of`.
     """
     import pandas as pd
 
@@ -260,7 +311,10 @@ def table(
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a row for each controller, with the columns of `COLUMNS`; see `TEXT`."""
+    """Return a table with a row for each controller: `agent`, and the columns of `COLUMNS`.
+
+    `runs` is what `table` returns. The constant `TEXT` defines the columns.
+    """
     by_agent = runs.groupby("agent", sort=False)
     by_plant = runs.groupby(["agent", "plant"], sort=False)
     ratios = by_plant["ratio"].median().groupby("agent", sort=False)
@@ -271,9 +325,20 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Arguments) -> None:
-    """Draw the picture, write the report and print it.
+    """Draw the map of errors, write the report and print it.
 
     If plants drift, the report has a table for each of `QUESTIONS` whose controllers have run.
+
+    Parameters
+    ----------
+    runs
+        The table of runs that `table` returns.
+    out
+        Folder of the report.
+    nominal
+        The plant that the controllers are made for.
+    provenance
+        Command, commit and versions, for the report.
     """
     from benchmarks.lib.report import Section, write_report
     from benchmarks.plots.sweep import draw
@@ -294,10 +359,12 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Argum
 
 
 def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:
-    """Return differences of the mean error in a pair, first minus second, degC, as text.
+    """Return a table of the differences between the mean errors of two controllers, as text.
 
-    A row is one of `GROUPS` with at least two plants on which all controllers of the pairs have
-    finished; a column is a pair. `runs` is what `table` returns.
+    A difference is the mean error of the first controller in a pair minus that of the second,
+    degC, with a 95 % interval. The table has a column for each of `pairs`, and a row for each
+    of `GROUPS` with at least two plants on which all controllers of the pairs have finished.
+    `runs` is what the function `table` returns.
     """
     import pandas as pd
 

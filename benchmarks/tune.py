@@ -34,23 +34,26 @@ from mptc_gym import PRESETS, Parameters
 if TYPE_CHECKING:
     import pandas as pd
 
-SEED = SEEDS["sampler"].first
-STARTUP = 200  # trials at random before the sampler learns
-FIRST_RUN = SEEDS["preparation"].first  # seed of the runs of a trial
+SEED = SEEDS["sampler"].first  # seed of Optuna's sampler in the first trial
+STARTUP = 200  # number of trials with random gains, before the sampler learns from trials
+FIRST_RUN = SEEDS["preparation"].first  # seed of the first run of every trial
 SPACING = 100_000  # from the first seed of a case to the first seed of the next case
-FINALISTS = 10  # of the best trials, which are judged again
-FINAL_RUNS = 1000  # of each case, to judge a finalist
-FINAL_FIRST_RUN = SEEDS["finals"].first
-PENALTY = 5.0  # degC, for failing to settle: the cost of doing nothing about an error of 5 degC
-LARGEST_ZONE = 0.95  # of a scaled dead zone, as a share of the larger limit of the flow
+FINALISTS = 10  # number of best trials that are judged again on new runs
+FINAL_RUNS = 1000  # runs of each case, to judge a finalist
+FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first run of a finalist
+# Penalty for a run that does not settle, degC: the mean error of an idle valve if the set point
+# is 5 degC.
+PENALTY = 5.0
+LARGEST_ZONE = 0.95  # largest dead zone of a case, as a share of the larger limit of the flow
 TUNED = [name for name, spec in ROSTER.items() if spec.spans]
 NOTE = (
     "For each case, the median over runs of the mean absolute error, °C. The objective is the "
     f"mean of these medians, plus {PENALTY:g} °C times the share of runs that do not settle at "
     "the constant set point; on another plant, that penalty is scaled with the set points."
 )
-PAPER = Parameters()
-PAPER_NOISE = PRESETS["noisy"]["noise_variance"]  # degC^2
+PAPER = Parameters()  # the paper's plant
+PAPER_NOISE = PRESETS["noisy"]["noise_variance"]  # noise variance R of the paper, degC^2
+# Arguments of the environment for a plant without noise and load disturbance.
 QUIET: Arguments = {
     "noise_variance": 0.0,
     "measurement_noise_variance": 0.0,
@@ -60,15 +63,16 @@ QUIET: Arguments = {
 
 
 class TuningCase(NamedTuple):
-    """A case of the search."""
+    """A case on which a search evaluates controllers."""
 
     samples: int  # length of a run
-    first: int  # sample at which the mean error begins
-    arguments: Arguments  # of the environment
+    first: int  # first sample that counts in the mean error
+    arguments: Arguments  # arguments of the environment
 
 
-# Neighbours of the paper's cases. Three cases count the errors of an untrained controller from
-# the first sample on, and two count only what follows learning.
+# Cases on the paper's plant that are similar to the paper's cases, but not equal, so that gains
+# are not tuned to a published result. In three cases, the mean error of an untrained controller
+# counts from the first sample on; in two cases, it counts only after the controller has learnt.
 CASES = {
     "constant": TuningCase(600, 0, {"setpoint": 4.8}),
     "dead zone": TuningCase(
@@ -104,7 +108,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run the search, and write and print its results."""
+    """Run the search, write and print its results, and return the closing message for users."""
     from benchmarks.lib.report import Section, write_report
 
     provenance = origin()
@@ -136,11 +140,24 @@ def work(options: Options) -> str:
 
 
 def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
-    """Score the best trials on new runs, and return a row for each, the best first.
+    """Score the best trials of a search on new runs, and return a row for each, best first.
 
-    The best gains of a search owe some of their result to luck; new runs show how much. A row
-    is what `score` returns, with the objective "in the search". `trials` is what `search`
-    returns for a plant with these arguments of the environment.
+    The best gains of a search owe some of their result to luck, and new runs show how much.
+
+    Parameters
+    ----------
+    name
+        Name of the controller.
+    plant
+        Arguments of the environment for the plant of the search.
+    trials
+        The trials of the search, as `search` returns them.
+
+    Returns
+    -------
+    DataFrame
+        A row for each finalist: the numbers that `score` returns, and the objective of the
+        trial "in the search", degC.
     """
     import pandas as pd
 
@@ -154,10 +171,24 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def spans_of(spec: ControllerSpec, plant: Arguments) -> Mapping[str, tuple[float, float]]:
-    """Return where to search for each gain of a controller on a plant, by name.
+    """Return the interval of the search for each gain of a controller, by the gain's name.
 
-    A pair holds the values of the smallest and of the largest magnitude. A `UsageError` is
-    raised if the plant's gain or time constant does not define them.
+    An interval is a pair: the value with the smallest magnitude, and the value with the largest
+    magnitude, both of the same sign.
+
+    Parameters
+    ----------
+    spec
+        The controller.
+    plant
+        Arguments of the environment for the plant.
+
+    Raises
+    ------
+    ValueError
+        If the controller has no gains to search.
+    UsageError
+        If the plant has no gain or time constant that defines the intervals.
     """
     if spec.spans is None:
         raise ValueError(f"{spec.name} has no gains to search")
@@ -166,11 +197,13 @@ def spans_of(spec: ControllerSpec, plant: Arguments) -> Mapping[str, tuple[float
 
 
 def cases(plant: Arguments) -> dict[str, TuningCase]:
-    """Return the cases of a search on a plant by name: those of the paper's plant, scaled.
+    """Return the cases of a search on a plant, by name: scaled versions of `CASES`.
 
-    Set points scale with `setpoint_amplitude`, lengths with `setpoint_period`, and the dead
-    zone and the noise with the plant's; a plant without noise has some in the case "noise".
-    At the constant set point there are neither noise nor load, so that a loop can settle.
+    `plant` holds arguments of the environment. Set points are scaled in proportion to
+    `setpoint_amplitude`, the lengths of runs in proportion to `setpoint_period`, and dead zone
+    and noise in proportion to the plant's own values. A plant without noise gets some noise in
+    the case "noise". In the case "constant" there are neither noise nor load, so that every
+    good loop can settle.
     """
     parameters = Parameters(**plant)
     amplitude = parameters.setpoint_amplitude / PAPER.setpoint_amplitude
@@ -203,12 +236,25 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
 
 
 def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> pd.DataFrame:
-    """Try `count` sets of gains of a controller, and return a row for each trial.
+    """Try sets of gains of a controller, and return a table with a row for each trial.
 
-    A row is what `score` returns. The rows are also written to `trials.csv` in the folder, as
-    far as they have come. Which gains a trial tries follows from the trials before it. So an
-    interrupted search takes the same course again, and finds the results of its first trials in
-    the folder.
+    A row has the numbers that `score` returns. After an interruption, the rows of the finished
+    trials are in `trials.csv`. The gains of a trial follow from the results of the trials
+    before. So an interrupted search that starts again tries the same gains, and loads the
+    results of finished trials from the folder.
+
+    Parameters
+    ----------
+    name
+        Name of the controller.
+    plant
+        Arguments of the environment for the plant.
+    count
+        Number of trials.
+    runs
+        Runs of each case in a trial.
+    folder
+        Folder of `trials.csv` and of the results of single trials.
     """
     import optuna
     import pandas as pd
@@ -249,11 +295,28 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
 def score(
     name: str, plant: Arguments, runs: int, first_run: int, gains: Mapping[str, float]
 ) -> dict[str, float]:
-    """Run a controller with these gains in all cases, and return a row of numbers.
+    """Run a controller with some gains in all cases, and return a dict of numbers.
 
-    The row has the gains by name; the median mean error of each case, degC, by its name; "not
-    converged", the share of runs that do not settle at the constant set point; and the
-    "objective", degC, as `NOTE` says. The seeds of the first case begin with `first_run`.
+    Parameters
+    ----------
+    name
+        Name of the controller.
+    plant
+        Arguments of the environment for the plant.
+    runs
+        Runs of each case.
+    first_run
+        Seed of the first run of the first case.
+    gains
+        The gains by name.
+
+    Returns
+    -------
+    dict
+        The gains by name; the median over runs of the mean error in each case, degC, by the
+        name of the case; "not converged", the share of runs that do not settle at the constant
+        set point; and "objective", degC, which the search minimises: the mean of these medians
+        plus a penalty for runs that do not settle.
     """
     controller = ROSTER[name].with_gains(gains)
     medians: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""Compute lower bounds for every controller, a reference, and a score."""
+"""Compute least possible mean errors: lower bounds for every controller, and a reference."""
 
 from typing import Any
 

@@ -66,9 +66,10 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Print the bounds of the cases and of the presets, or of another plant.
+    """Print the bounds of all cases and presets, or of another plant; return a note for users.
 
-    After an error or an interruption the cases that have finished are printed.
+    After an error or an interruption, the cases that have finished are printed. With the option
+    `package`, the bounds that ship with the package are written instead.
     """
     import pandas as pd
 
@@ -90,9 +91,10 @@ def work(options: Options) -> str:
 
 
 def row(case: Scenario, options: Options) -> dict[str, str]:
-    """Return the name of a case and its errors, degC, as text by the headings of the table.
+    """Return the table's row for a case: its name and its errors, degC, as text.
 
-    A cell is empty if the case has no bound of this kind, or no load to estimate.
+    The keys are the headings of the table. The text is empty if the case has no bound of a
+    kind, or if it has no load for the estimate.
     """
     from benchmarks.bounds.least import least_possible, with_hidden_load
     from benchmarks.controllers.roster import ROSTER
@@ -122,10 +124,13 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
 
 
 def write_package(fan_out: FanOut) -> str:
-    """Write the least possible error of each case, for each episode where they differ.
+    """Write the least possible errors that ship with the package, `bounds.json`.
 
-    Each case has the bounds of the published episodes, "least". Where bounds differ between
-    episodes, it also has the bounds of the episodes to choose policies by, "validation_least".
+    Each case of `PACKAGED` has a list "least", the bounds of the episodes of published scores,
+    degC; the list has one number if all episodes have the same bound. If bounds differ between
+    episodes, the case also has a list "validation_least", the bounds of the episodes on which
+    policies are selected. `fan_out` runs the cases in parallel. The closing message of the
+    command is returned.
     """
     from benchmarks.bounds.least import least_possible
 

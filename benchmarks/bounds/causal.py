@@ -1,26 +1,30 @@
 """Penalise flows that use the future, to bound the cost of not knowing the next set point.
 
-With `setpoint="random"` the set point has a law: levels are independent and uniform in
-[-A, A], and each is held for a number of samples that is uniform from S to L. A controller
-without preview learns of a change when it happens. So u_a(j) depends only on the set points up
-to j, and for every pi(j) with E[pi(j) | set points up to j] = 0,
+With the environment's argument `setpoint="random"`, the set point is piecewise constant with a
+known distribution. Its *levels*, the values between changes, are independent and uniformly
+distributed in [-A, A]. The number of samples for which a level lasts is uniformly distributed
+from S to L. The *age* of a level is the number of samples since the level began.
+
+A controller without preview learns of a change of the set point when the change happens. So the
+flow u_a(j) depends only on the set points up to j. For every price pi(j) of the flow with
+E[pi(j) | set points up to j] = 0, it follows that
 
     E[sum_j pi(j) u_a(j)] = 0.
 
-Hence the mean error of such a controller is the mean of the sum of |e(k)| and pi(k) u_a(k).
-For given set points, this sum is at least its minimum over all flows, even flows that use the
-future; so its mean is at least the mean of these minima over the set points (D. B. Brown,
-J. E. Smith and P. Sun, "Information relaxations and duality in stochastic dynamic programs",
-Operations Research 58, 2010, 785-801). Every pi gives a bound; a poor pi makes the bound loose,
-never wrong. Here pi is
+Hence the expected sum of errors |e(k)| of a controller without preview equals the expected sum
+of |e(k)| + pi(k) u_a(k). For fixed set points, the sum of |e(k)| + pi(k) u_a(k) is at least its
+minimum over all flows, even flows that use the future. So the mean over the set points of these
+minima is a lower bound (D. B. Brown, J. E. Smith and P. Sun, "Information relaxations and
+duality in stochastic dynamic programs", Operations Research 58, 2010, 785-801). Every pi gives
+a valid bound, but a poor choice of pi makes the bound loose. The choice of pi in this module is
 
     pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
 
-G[k, j] is the effect of u_a(j) on y(k), and g(k) a guess of the slope of E|e(k)|, whose
-conditional means have a closed form. After a change of the set point, g is the sign of the
-change, until the output can have followed. Later in the hold, g is a number between -1 and 1,
-odd in the level, that weighs staying at the level against moving ahead to where the next level
-is expected. The *age* of a level is the number of samples since it began.
+G[k, j] is the effect of the flow u_a(j) on the output y(k). The number g(k) is a guess of the
+slope of E|e(k)|, whose conditional means have a closed form. After a change of the set point, g
+is the sign of the change, until the output can have followed. At later ages of the level, g is
+a number between -1 and 1, odd in the level. It weighs staying at the present level against
+moving towards 0, where the next level is expected.
 """
 
 import numpy as np
@@ -34,20 +38,29 @@ from mptc_gym.signals import Levels
 
 Array = NDArray[np.float64]
 
-THRESHOLDS = 8  # thresholds that represent the noise in the guess
-# A finite stand-in for the reach of an integrating plant, which reaches every temperature.
-LARGEST_GAIN = 1e9  # degC per t/h
-# The output counts as having followed a change that is out of reach after four time constants.
+# Number of thresholds of the error, equally probable, that represent the noise in the guess g.
+THRESHOLDS = 8
+# Largest steady-state gain, degC per t/h. It stands for the infinite gain of an integrating
+# plant, which can reach every temperature.
+LARGEST_GAIN = 1e9
+# If the flow's limits keep the output from reaching a set point, the output counts as having
+# followed after four time constants. This is the share of the way after four time constants.
 FOLLOWED = 1.0 - np.exp(-4.0)
-# Samples after which the response to a flow no longer counts in the guess late in a hold.
+# Samples after which the impulse response of the plant is neglected in the guess g.
 HORIZON = 200
 
 
 class SetPointLaw:
-    """The law of random set points, and the guess g for it on one plant.
+    """The distribution of random set points on one plant, and the penalty for using the future.
 
-    The guess uses the plant's dynamics at the start of the episode. The episode is as long as
-    the `model`, which covers samples of one plant; `unknown` belongs to the same plant.
+    The guess g in the penalty uses the plant's dynamics at the start of the episode.
+
+    Parameters
+    ----------
+    model
+        The plant, for all samples of an episode.
+    unknown
+        The lower bounds of E|m - n| for the same plant; they tell how large the noise is.
     """
 
     def __init__(self, model: LinearModel, unknown: Unknown) -> None:
@@ -60,7 +73,7 @@ class SetPointLaw:
         self._amplitude = levels.amplitude
         self._shortest = levels.shortest
         self._longest = levels.longest
-        # The largest temperature, degC, that the flow can hold on both sides of 0.
+        # The largest temperature, degC, that a constant flow can keep on both sides of 0.
         low, high = model.limits
         gain = min(float(np.abs(at_start.gain)), LARGEST_GAIN)
         self._reach = gain * min(-low, high)
@@ -71,25 +84,27 @@ class SetPointLaw:
         self._thresholds = np.zeros(1)
         if deviation > 0.0:
             self._thresholds = deviation * scipy.special.ndtri((1.0 + shares) / 2.0)
-        # After a change the output stands still for `lag` samples. Then it approaches what the
-        # limits allow; this is the share of the way that it has made, by age of the level.
+        # After a change of the set point, the output does not move for `lag` samples. Then the
+        # output approaches the farthest temperature that the limits allow. `_progress` is the
+        # share of this way that the output has made, by the age of the level.
         age = np.arange(samples)
         slowest_pole = np.abs(np.roots([1.0, *-at_start.alpha])).max(initial=0.0)
         self._progress = 1.0 - slowest_pole ** np.maximum(age - model.lag + 1, 0)
         # The age from which on the output has followed the largest change within reach.
         largest_share = 2.0 * self._amplitude / max(self._reach + self._amplitude, 1e-9)
         self._settled = int(np.searchsorted(self._progress, min(largest_share, FOLLOWED)))
-        # The probability that a level is still held at an age.
+        # The probability that a level lasts beyond an age, by age.
         lengths = self._longest - self._shortest + 1
         self._still_held = np.clip((self._longest - age) / lengths, 0.0, 1.0)
-        # The response to 1 t/h of flow, by the number of samples since the output can follow.
+        # The response to an impulse of 1 t/h of flow, degC, by the number of samples since the
+        # first sample at which the output reacts.
         zeros = model.lag - int(model.numbers.delay) - 1  # leading zeros of B
         self._impulse = at_start.impulse_response(samples + zeros)[zeros:]
 
     def penalty(self, setpoint: Array) -> Array:
-        """Return pi(j), the price of u_a(j), degC per t/h, shape (samples,).
+        """Return the prices pi(j) of the flows u_a(j), degC per t/h, shape (samples,).
 
-        `setpoint` is one draw of y_d(k), degC, shape (samples,).
+        `setpoint` holds the set points y_d(k) of one episode, degC, shape (samples,).
         """
         samples = len(setpoint)
         holds = held(setpoint)
@@ -98,8 +113,8 @@ class SetPointLaw:
         guesses_of_holds = []
         for start, end in holds:
             level = setpoint[start]
-            # What a change adds to the mean of g, summed up, after zeros for the time before
-            # the change.
+            # The mean of what a change at the end of this level adds to g, as a cumulative sum
+            # over the samples after the change. Zeros stand for the time before the change.
             summed = np.cumsum(self._mean_slope(level) * self._still_held)
             added = np.append(np.zeros(self._longest + 1), summed)
             stay = self._slope(level_before, level) + self._lean(added)
@@ -117,11 +132,24 @@ class SetPointLaw:
     def _expected(
         self, ages: NDArray[np.intp], known_age: int, stay: Array, added: Array
     ) -> Array:
-        """Return the mean of g at later ages of a level that is known to be held at an age.
+        """Return the expected guess g at later ages of a level that lasts at the present age.
 
-        `ages` are later than `known_age`, samples. `stay` is g by age if the level never
-        changes. `added` is what a change adds to the mean of g, summed up, from `longest + 1`
-        samples before the change on.
+        Parameters
+        ----------
+        ages
+            Ages of the level at which g is wanted, samples, all later than `known_age`.
+        known_age
+            The present age of the level, samples: the level has not changed up to this age.
+        stay
+            The guess g by age if the level never changes, shape (samples,).
+        added
+            The mean of what a change of the level adds to g, as a cumulative sum over samples,
+            from `longest + 1` samples before the change on.
+
+        Returns
+        -------
+        ndarray
+            The conditional means of g, in the shape of `ages`.
         """
         # The next level begins at an age from `first` to `longest`, all equally probable.
         first = max(self._shortest, known_age + 1)
@@ -133,9 +161,10 @@ class SetPointLaw:
         return expected
 
     def _slope(self, before: float, after: float) -> Array:
-        """Return g by age, from a change on until the output can have followed.
+        """Return the guess g after a change of the set point, by age, shape (samples,).
 
-        The level changes from `before` to `after`, degC. The shape is (samples,).
+        The set point changes from `before` to `after`, degC. From the age at which the output
+        can have followed the change, the returned g is 0.
         """
         change = after - before
         room = max(self._reach - np.sign(change) * before, 0.0)
@@ -145,7 +174,10 @@ class SetPointLaw:
         return slope
 
     def _mean_slope(self, before: float) -> Array:
-        """Return the mean of `_slope` over all levels after `before`, degC, by age."""
+        """Return the mean of `_slope` over all possible next levels, by age, shape (samples,).
+
+        `before` is the level before the change, degC.
+        """
         A = self._amplitude
         progress = self._progress[:, np.newaxis]
         upwards = A - before - max(self._reach - before, 0.0) * progress - self._thresholds
@@ -156,10 +188,12 @@ class SetPointLaw:
         return mean
 
     def _lean(self, added: Array) -> Array:
-        """Return g by age late in a hold, such that it pays to stay; `added` as in `_expected`.
+        """Return the guess g at ages when the output has followed, by age, shape (samples,).
 
-        At every age a flow is then worth nothing on average: the sum over later ages of its
-        response times the mean of g vanishes. This is solved backwards from the last age.
+        The guess is such that an additional flow at any of these ages changes the expected
+        error by nothing: the sum over later ages of the impulse response times the mean of g is
+        0. These equations are solved backwards from the last age. `added` is defined as in
+        `_expected`.
         """
         samples = len(self._still_held)
         lean = np.zeros(samples)

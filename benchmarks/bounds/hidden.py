@@ -1,15 +1,16 @@
-"""Estimate what it adds to the least possible error that no controller sees the load.
+"""Estimate how much the least possible error grows as no controller can measure the load.
 
-The bounds assume that the load is known up to k - d - 1. A controller has only the readings of
-the transmitter, in which noise hides the load. No bound is known that counts this, so it is
-estimated, and reports show the estimate beside the bound under the name "hidden load".
+The bounds of `least.py` assume that the load disturbance is known up to the sample k - d - 1,
+where d is the plant's delay. A real controller has only the transmitter's readings, in which
+noise hides the load. No lower bound is known for controllers with readings alone, so their
+least possible error is estimated. Reports show the estimate as "hidden load" beside the bound.
 
-The estimate treats the load as normal, with the variances and correlations that it has. Then
-the unknown part of y(k) is normal, too, with a variance that the Kalman filter gives, and the
-least possible error follows as in `linear_program.py`: once with the load known up to
-k - d - 1, once with readings alone. The difference of the two errors is added to the bound.
-Both errors are too large for a load that jumps, which is zero most of the time and large
-otherwise; in their difference this cancels for the greater part.
+The estimate replaces the load by a normal process with the same variances and correlations.
+Then the unknown part of the output y(k) is normal, with a variance that a Kalman filter gives,
+and the least possible error follows as in `linear_program.py`. The least possible error is
+computed for a normal load that is known up to k - d - 1, and for readings alone. The difference
+of the two errors is added to the bound. Both errors are too large for a load that jumps, which
+is zero most of the time and large otherwise; most of this excess cancels in the difference.
 """
 
 import numpy as np
@@ -27,11 +28,17 @@ from mptc_gym.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
-STEPS, WALK = -2, -1  # places of the two parts of the load in the state
+# Places of the two parts of the load, the piecewise constant part and the random walk, in the
+# state vector.
+STEPS, WALK = -2, -1
 
 
 def unknown_of_normal_load(model: LinearModel) -> Unknown:
-    """Return what remains unknown if the load is normal, and known up to k - d - 1."""
+    """Return the bounds of E|m(k) - n(k)| for a normal load that is known up to k - d - 1.
+
+    Here d is the plant's delay, n(k) the part of the output that is unknown at k - d - 1, and
+    m(k) the error without n(k). `model` is the plant, for the samples of an episode.
+    """
     F, Q = _with_load(model)
     filtered = np.zeros_like(F)  # a known load has no variance
     if model.numbers.measurement_noise_variance > 0.0:
@@ -42,17 +49,24 @@ def unknown_of_normal_load(model: LinearModel) -> Unknown:
 
 
 def unknown_of_hidden_load(model: LinearModel) -> Unknown:
-    """Return what remains unknown if the load is normal, and seen through readings alone."""
+    """Return the bounds of E|m(k) - n(k)| for a normal load and a controller with readings.
+
+    Only the transmitter's readings up to k - d - 1 are known, where d is the plant's delay.
+    Here n(k) is the part of the output that is then unknown, and m(k) the error without n(k).
+    `model` is the plant, for the samples of an episode.
+    """
     F, Q = _with_load(model)
     filtered = filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
     return unknown_of_normal(predicted_variance(filtered, F, Q, model.lag))
 
 
 def _with_load(model: LinearModel) -> tuple[Array, Array]:
-    """Return F(k) and Q(k) of the state of (28), followed by the load's steps and its walk.
+    """Return F(k) and Q(k) of a state-space form of the plant with its load disturbance.
 
-    x(k) = F(k) x(k-1) + a noise with the covariance Q(k). Both have the shape (samples, size,
-    size). The load, degC, is the sum of the steps and the walk.
+    The state is x(k) = F(k) x(k-1) + v(k), where v(k) is white with the covariance Q(k). The
+    first elements of x(k) are a state of equation (28) of the paper, the output first. The last
+    two elements are the piecewise constant part and the random walk of the load, degC, whose
+    sum is the load. F and Q have the shape (samples, size, size), for the samples of `model`.
     """
     numbers = model.numbers
     F_noise, Q_noise = noise_system(model)
@@ -61,7 +75,8 @@ def _with_load(model: LinearModel) -> tuple[Array, Array]:
     k = np.arange(samples)
     is_change = (k % LOAD_INTERVAL == 0) & (k > 0)
     jump = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval)  # probability
-    stays = np.where(is_change, 1.0 - jump, 1.0)  # mean of a level, as a share of the level
+    # The mean of the piecewise constant part at k, as a share of its value at k - 1.
+    stays = np.where(is_change, 1.0 - jump, 1.0)
 
     F = np.zeros((samples, size, size))
     F[:, :STEPS, :STEPS] = F_noise
@@ -70,7 +85,7 @@ def _with_load(model: LinearModel) -> tuple[Array, Array]:
     F[:, 0, STEPS] = model.load * stays
     F[:, 0, WALK] = model.load
 
-    # The level is 0 until the first jump, and uniform from then on.
+    # The piecewise constant part is 0 until its first jump, and uniformly distributed after it.
     has_jumped = 1.0 - np.cumprod(stays)  # probability
     level_variance = has_jumped * numbers.disturbance_amplitude**2 / 3.0
     variance_before = np.append(0.0, level_variance[:-1])

@@ -1,10 +1,10 @@
 """Compute the least possible mean error of any case of the environment, and scores from it.
 
-README.md says for which controllers each kind of bound holds. The mean error is the mean of
-|e(k)| over k = 1 to N, the samples that have rewards. A controller at k may know the
-transmitter's readings up to k, and perhaps any set points, plant numbers and loads up to k, but
-neither the true output, `info["output"]`, nor when the load jumps next. It may undo the dead
-zone.
+The mean error is the mean of |e(k)| over the samples k = 1 to N of an episode, where e(k) is
+the set point minus the output, degC. The file README.md says for which controllers each kind of
+bound holds. A controller at k may know the transmitter's readings, the set points, the plant's
+parameters and the loads up to k, but neither the true output, `info["output"]`, nor the time of
+the load's next jump. The controller may compensate the dead zone.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,28 +37,32 @@ from mptc_gym.parameters import PlantNumbers
 
 Array = NDArray[np.float64]
 
+# "preview": a lower bound for controllers that know future set points; "causal": a lower bound
+# for controllers that do not; "reference": the least error of a controller that expects no
+# change of the set point.
 KINDS = "preview", "causal", "reference"
 
 
 @dataclass(frozen=True)
 class LeastPossible(Estimate):
-    """The least possible mean |e| of a case, degC, with a 95 % interval over drawn episodes.
+    """The least possible mean |e| of a case, degC, with a 95 % interval over random episodes.
 
-    The ends of the interval equal `value` where nothing is drawn.
+    If the bound is the same for all episodes, both ends of the interval equal `value`.
     """
 
     kind: str  # one of `KINDS`
     idle: Estimate  # mean |e| of the same episodes with an idle valve, degC
-    # The terms of which `value` is the mean, degC: term i belongs to the episode of seed
-    # `seed + i`. For the kind "causal" a term alone is no bound. There is one term if the bound
-    # is the same for all episodes.
+    # The bounds of the episodes, degC, of which `value` is the mean: number i belongs to the
+    # episode with the seed `seed + i`. For the kind "causal" only the mean is a bound. There is
+    # one number if the bound is the same for all episodes.
     episodes: tuple[float, ...]
 
     def score(self, errors: ArrayLike) -> Array:
-        """Return scores of mean errors, degC: 0 for an idle valve, 1 for `value`.
+        """Return scores: 0 for the error of an idle valve, 1 for the least possible error.
 
-        The score of a single run may exceed 1 by chance. A ValueError is raised if no
-        controller is better than an idle valve.
+        `errors` are mean errors of controllers, degC, of any shape; the scores have the same
+        shape. The score of a single run may exceed 1 by chance. A ValueError is raised if the
+        least possible error is not below that of an idle valve.
         """
         idle = self.idle.value
         if idle - self.value <= 1e-9 * max(idle, 1.0):
@@ -75,29 +79,29 @@ def least_possible(
     seed: int = SEED,
     **arguments: Any,
 ) -> LeastPossible:
-    """Return the least possible mean |e(k)| over k = 1 to `samples`.
+    """Return the least possible mean |e(k)| of a case over k = 1 to `samples`, degC.
 
     Parameters
     ----------
     samples
         N, the length of an episode.
     kind
-        One of `KINDS`. None chooses as reports and `mptc_gym.evaluate` do: "causal" for random
-        set points; otherwise "reference", or "preview" if the case has no reference or if the
-        set point never changes.
+        One of `KINDS`. With None, the kind is that of reports and of `mptc_gym.evaluate`:
+        "causal" for random set points; otherwise "reference", or "preview" if the case has no
+        reference or if the set point never changes.
     episodes
-        Number of episodes, if anything is drawn.
+        Number of episodes over which the bound is averaged, if it differs between episodes.
     seed
-        Episode i is the one that the environment draws with seed `seed + i`. The defaults are
-        the episodes of `mptc_gym.evaluate`.
+        Seed of the first episode: episode i is the environment's episode with the seed
+        `seed + i`. By default, the episodes are those of `mptc_gym.evaluate`.
     **arguments
-        Arguments of the environment.
+        Arguments of the environment, which define the case.
 
     Raises
     ------
     NoBoundError
-        If the case has no bound of this kind: "causal" is for random set points alone,
-        "reference" for set points that hold until the plant has settled.
+        If the case has no bound of this kind: "causal" needs random set points, and "reference"
+        needs set points that do not change before the plant has settled.
     ValueError
         If an argument is out of its range.
     """
@@ -135,10 +139,10 @@ def with_hidden_load(
     seed: int = SEED,
     **arguments: Any,
 ) -> Estimate:
-    """Estimate the least possible mean |e(k)| of controllers that do not see the load, degC.
+    """Estimate the least possible mean |e(k)| if the load cannot be measured, degC.
 
-    This is no bound: see `hidden.py`. The arguments are those of `least_possible`. Without a
-    load the estimate is the bound.
+    The estimate is not a bound: see `hidden.py`. For a case without a load, the bound is
+    returned. The arguments and the errors are those of `least_possible`.
     """
     least = least_possible(
         samples=samples, kind=kind, episodes=episodes, seed=seed, **arguments
@@ -157,7 +161,7 @@ def with_hidden_load(
 
 
 class _Episodes(NamedTuple):
-    """What the environment draws for some episodes of N samples."""
+    """Plant numbers, set points and idle-valve errors of some episodes of N samples."""
 
     numbers: Sequence[PlantNumbers[float]]  # the plant numbers of each episode
     setpoints: Array  # y_d(k) for k = 0 to N, degC, shape (episodes, N + 1)
@@ -166,7 +170,19 @@ class _Episodes(NamedTuple):
 
 
 def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
-    """Return the episodes of seeds `seed` to `seed + episodes - 1`, of `samples` samples."""
+    """Return the episodes that the environment makes for some seeds.
+
+    Parameters
+    ----------
+    parameters
+        The arguments of the environment.
+    samples
+        N, the length of an episode.
+    episodes
+        Number of episodes.
+    seed
+        Episode i has the seed `seed + i`.
+    """
     numbers = drawn_numbers(parameters, episodes, seed)
     with closing(make_plants(episodes, samples + 1, **asdict(parameters))) as plants:
         idle_valve = IdleValve(numbers.u_min, numbers.u_max)
@@ -178,7 +194,7 @@ def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Ep
     )
 
 
-@cache  # as a report asks for several kinds of a case
+@cache  # as a report asks for the same bound several times
 def _bound(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
@@ -204,11 +220,12 @@ def _error_sum(
     setpoint: Array,
     unknown_of: Callable[[LinearModel], Unknown] = unknown,
 ) -> float:
-    """Return the term of one episode in a bound on the sum of |e(k)| over k = 1 to N, degC.
+    """Return one episode's bound on the sum of |e(k)| over k = 1 to N, degC.
 
-    The term is the sum of the bounds of E|e(k)|. For the kind "causal" the term also includes
-    the penalty of the flows, and for the kind "reference" the small price of valve travel, as
-    solvers agree on this sum alone.
+    The sum of the lower bounds of E|e(k)| is returned. For the kind "causal", the penalty of
+    the flows is added, and only the mean over episodes is a bound. For the kind "reference",
+    the small price of valve travel is added, as different solvers agree on the sum of errors
+    and price only.
 
     Parameters
     ----------
@@ -219,9 +236,10 @@ def _error_sum(
     numbers
         The plant numbers of the episode.
     setpoint
-        y_d(k) for k = 0 to N, degC, shape (N + 1,).
+        Set points y_d(k) for k = 0 to N, degC, shape (N + 1,).
     unknown_of
-        Returns what no controller knows of a plant: the bounds of E|m - n|.
+        Function that returns the lower bounds of E|m(k) - n(k)| for a plant, where n(k) is what
+        no flow can counteract in time, and m(k) the error without n(k).
     """
     k = np.arange(len(setpoint))
     if kind == "reference":  # which looks beyond the end of the episode

@@ -14,49 +14,54 @@ from benchmarks.loop.rollout import held
 
 Array = NDArray[np.float64]
 
-# A response below this fraction of the largest response is left out of a program.
+# Effects of a flow on an output below this fraction of the largest effect are set to 0, so that
+# the matrix of a linear program is sparse.
 NEGLIGIBLE_RESPONSE = 1e-9
-# A method of `scipy.optimize.linprog`, and whether HiGHS simplifies the program first. For a
-# few plants the simplification fails, so the next pair is tried.
+# Pairs of a method of `scipy.optimize.linprog` and whether its solver, HiGHS, simplifies the
+# program first. For a few plants a pair fails, and the next pair is tried.
 SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)
 TIME_LIMIT = 30.0  # s for each attempt; most programs take less than 1 s
 
-# A plant counts as settled if its flow moves by less than this fraction of the range of the
-# flow during one lag.
+# A plant counts as settled if the flow stays within this fraction of the actuator's range for
+# the lag of the plant, the time from a flow to its first effect.
 SETTLED = 0.05
-# Samples by which a plan looks beyond the end of a hold, in addition to the lag. With more
-# samples the references of the presets are the same.
+# Samples by which the plan of a reference looks beyond a change of the set point, in addition
+# to the lag. With more samples the references of the presets are the same.
 TAIL = 60
-# Two prices far below the price of an error, which is 1, select among equally good plans: the
-# smallest slope of the error makes a plan end at the set point, and the price of each t/h of
-# valve travel keeps the valve quiet.
+# Two small prices that select among plans with equal errors; the price of an error is 1. With
+# `SMALLEST_SLOPE`, degC for each degC, a plan ends at the set point. With `TRAVEL_PRICE`, degC
+# for each t/h of valve travel, the valve moves no more than needed.
 SMALLEST_SLOPE = 0.001
 TRAVEL_PRICE = 1e-4
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """Lower bounds of E|m - n|: at each k, the highest of the lines intercept + slope * |m|.
+    """Lower bounds of E|m - n| at each sample: the highest of lines in |m|.
 
-    Here m is the expected error and n what remains unknown, degC; see `unknown.py`.
+    Here n is the part of the output, degC, that no flow can counteract in time, and m the error
+    without n; see `unknown.py`. A line is intercept + slope * |m|.
     """
 
-    slopes: Array  # ascending, from 0 to 1; or 1 alone if nothing is unknown; shape (slopes,)
-    intercepts: Array  # degC, shape (samples, slopes)
+    # The slopes of the lines, ascending from 0 to 1, shape (slopes,). If nothing is unknown, n
+    # is 0, and the only slope is 1.
+    slopes: Array
+    intercepts: Array  # of the lines at each sample, degC, shape (samples, slopes)
 
     def mean_error(self, m: Array) -> Array:
-        """Return the lower bounds of E|m(k) - n(k)|, degC, shape (len(m),).
+        """Return the lower bounds of E|m(k) - n(k)| for expected errors m(k).
 
-        m(k), degC, are the expected errors of the first len(m) samples.
+        `m` holds the expected errors of the first samples, degC, shape (count,), and the bounds
+        have the same unit and shape.
         """
         lines = self.intercepts[: len(m)] + self.slopes * np.abs(m)[:, np.newaxis]
         return np.asarray(lines.max(axis=1))
 
     @property
     def lengths(self) -> Array:
-        """Lengths of the intervals of |m| on which each line is the highest, degC.
+        """Lengths of the intervals of |m| on which each line is the highest line, degC.
 
-        The shape is that of `intercepts`. The last line is the highest up to infinity.
+        The shape is (samples, slopes). The interval of the last line is infinitely long.
         """
         ends = np.full(self.intercepts.shape, np.inf)
         corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
@@ -65,9 +70,12 @@ class Unknown:
 
 
 def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
-    """Return A and B of (28) without noise, A y = B u, for an episode from rest.
+    """Return the matrices A and B of A y = B u for the plant without noise and load.
 
-    Both are sparse matrices of shape (samples, samples), for y in degC and u in t/h.
+    The vectors y and u hold the outputs, degC, and the flows, t/h, of an episode from rest. The
+    matrix equation is equation (28) of the paper for all samples of an episode. `model` is the
+    plant, and `samples` the length of the episode. Both matrices are sparse and have the shape
+    (samples, samples).
     """
     past_outputs = _lagged(model.alpha[:samples], 1)
     past_flows = _lagged(model.beta[:samples], int(model.numbers.delay) + 1)
@@ -75,19 +83,25 @@ def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
 
 
 def _lagged(coefficients: Array, lag: int) -> Any:
-    """Return a sparse square matrix with coefficients[k, i] in row k, column k - lag - i."""
+    """Return a sparse square matrix with coefficients[k, i] in row k, column k - lag - i.
+
+    `coefficients` has the shape (samples, order), and the matrix (samples, samples).
+    """
     samples, order = coefficients.shape
     diagonals = coefficients.T, lag + np.arange(order)
     return scipy.sparse.dia_array(diagonals, shape=(samples, samples)).T.tocsr()
 
 
 def response(A: Any, B: Any) -> Array:
-    """Return G, which solves A G = B: a flow of 1 t/h at j adds G[k, j] degC to y(k)."""
+    """Return G, which solves A G = B: a flow of 1 t/h at sample j adds G[k, j] degC to y(k).
+
+    `A` and `B` are what `equations` returns, of shape (samples, samples), as is G.
+    """
     return np.asarray(scipy.linalg.solve_triangular(A.toarray(), B.toarray(), lower=True))
 
 
 class Plan(NamedTuple):
-    """The expected flow with the smallest bound, and this bound."""
+    """The mean flow for which the sum of the bounds of E|e(k)| is least, and these bounds."""
 
     errors: Array  # lower bounds of E|e(k)|, degC, shape (samples,)
     flow: Array  # the mean of u_a(k), t/h, shape (samples,)
@@ -102,38 +116,43 @@ def plan(
     quiet: bool = False,
     penalty: ArrayLike = 0.0,
 ) -> Plan:
-    """Minimise the sum of the bounds of E|e(k)| over the mean flow.
+    """Return the mean flow for which the sum of the bounds of E|e(k)| is least.
 
-    Take any controller, causal or not, and let y and u_a stand for their means over all noise,
-    load and randomness of the controller. As (28) is linear, the means obey (28) without noise;
-    as u_a(k) always lies within the limits, so does its mean; and as E|m - n| is convex in m,
-    its mean over everything that may be known is at least its value at the mean of m, which is
-    y_d - y (Jensen). So the controller's error is at least the minimum over all mean flows
-    within the limits: a linear program, as each bound of E|m - n| is a maximum of lines.
+    The minimum is a lower bound for every controller, causal or not. To see this, let y and u_a
+    be the means of output and flow over all noise, load and randomness of the controller. As
+    equation (28) of the paper is linear, these means satisfy equation (28) without noise. As
+    the flow always lies within the limits, so does its mean. As E|m - n| is convex in the error
+    m without the unknown effects n, its mean over everything that may be known is at least its
+    value at the mean of m, which is y_d - y, the set point minus the mean output (Jensen's
+    inequality). So the controller's mean error is at least the minimum over all mean flows
+    within the limits. The minimum is a linear program, as each bound of E|m - n| is a maximum
+    of lines.
 
-    The bound is loose where the required flow lies within the dead zone, or alternates between
-    the two sides of a limit: the mean of 0 and 5 t/h is 2.5 t/h.
+    The bound is loose where the required flow lies inside the dead zone: the mean of the flows
+    0 and 5 t/h is 2.5 t/h, which no valve with a dead zone of 5 t/h passes. The bound is also
+    loose where the flow must alternate between the two sides of a limit.
 
     Parameters
     ----------
     model
         The plant, for at least as many samples as `setpoint` has.
     unknown
-        The bounds of E|m - n| for this plant.
+        The lower bounds of E|m - n| for this plant.
     setpoint
-        y_d(k), degC, shape (samples,).
+        Set points y_d(k), degC, shape (samples,).
     past
-        The flows at k = 0, 1, ... that are already decided, t/h, shape (start,).
+        Flows at k = 0, 1, ... that are already decided, t/h, shape (start,).
     quiet
-        Whether to take, of equally good plans, the one that comes to the set point with the
-        least valve travel.
+        Whether to prefer, among plans with equal errors, the plan that reaches the set point
+        with the least valve travel.
     penalty
-        A price of u_a(k), degC for each t/h, of shape (samples,) or the same for all samples.
+        The price of the flow u_a(k), degC for each t/h, of shape (samples,); or a number, the
+        price at all samples.
 
     Raises
     ------
     RuntimeError
-        If no solver solves the program within `TIME_LIMIT`.
+        If no solver solves the linear program within `TIME_LIMIT`.
     """
     samples = len(setpoint)
     start = np.size(past)
@@ -171,39 +190,57 @@ def plan(
 
 
 class _Variables(NamedTuple):
-    """Variables of a linear program, each array of shape (variables,)."""
+    """Variables of a linear program; each array has the shape (variables,)."""
 
-    cost: Array
-    low: Array
-    high: Array
+    cost: Array  # cost of each unit of a variable
+    low: Array  # lower bound of a variable
+    high: Array  # upper bound of a variable
 
 
 def _variables(count: int, cost: Any, low: Any, high: Any) -> _Variables:
-    """Return `count` variables; a cost or an end is an array or the same for all of them."""
+    """Return `count` variables of a linear program.
+
+    `cost` is the cost of each unit of a variable, and `low` and `high` are the bounds of the
+    variables. Each is an array of shape (count,), or a number for all variables.
+    """
     return _Variables(*(np.broadcast_to(values, count) for values in (cost, low, high)))
 
 
 class _Program(NamedTuple):
     """The linear program of `plan` over n samples.
 
-    The outputs y and the flows u obey A y = B u. The first n targets are set points minus the
-    effect of past flows: target k is output k, plus the pieces of m(k) above 0, minus the
-    pieces below 0. A quiet plan has n more targets: the target is flow k minus flow k - 1,
-    minus the move up, plus the move down. It is 0 but for the first flow, which moves from the
-    last past flow.
+    The outputs y and the flows u satisfy A y = B u. The expected error m(k) is a sum of pieces
+    above 0 and pieces below 0, one of each for every slope of its bound. The first n targets
+    are the set points minus the effects of past flows: target k equals output k, plus the
+    pieces of m(k) above 0, minus the pieces of m(k) below 0. A quiet plan, which limits valve
+    travel, has n more targets: each equals flow k minus flow k - 1, minus the move up, plus the
+    move down. These n targets are 0, except the first, which is the last past flow.
     """
 
-    A: Any  # sparse, shape (n, n)
-    B: Any  # sparse, shape (n, n)
-    targets: Array  # shape (n,), or (2 n,) of a quiet plan
-    outputs: _Variables  # degC, shape (n,)
-    flows: _Variables  # t/h, shape (n,)
-    pieces: _Variables  # of m, degC: for each slope n above 0 and n below 0
-    moves: _Variables  # t/h: n up and n down in a quiet plan, otherwise none
+    A: Any  # sparse matrix of the plant, shape (n, n)
+    B: Any  # sparse matrix of the plant, shape (n, n)
+    targets: Array  # right sides, shape (n,), or (2 n,) in a quiet plan
+    outputs: _Variables  # the effects of the flows on the outputs, degC, n variables
+    flows: _Variables  # t/h, n variables
+    pieces: _Variables  # pieces of m, degC: for each slope, n above 0 and then n below 0
+    moves: _Variables  # t/h: n moves up and n moves down in a quiet plan, otherwise none
 
 
 def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
-    """Return the flows of the least cost, t/h, shape (n,). `zeros` are those of B in (28)."""
+    """Return the flows with the least cost, t/h, shape (n,).
+
+    Parameters
+    ----------
+    program
+        The linear program.
+    zeros
+        The zeros of the polynomial B in equation (28) of the paper.
+
+    Raises
+    ------
+    RuntimeError
+        If no solver solves the program within `TIME_LIMIT`.
+    """
     n = len(program.flows.cost)
     # With outputs among the variables the program is sparse, and fast where A is slow. But if
     # a zero of B lies outside the unit circle, the flow that gives an output grows without
@@ -235,9 +272,11 @@ def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
 
 
 def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
-    """Return a matrix and the right side: the matrix times all variables is the right side.
+    """Return the equality constraints of a program: a matrix M and a vector r with M x = r.
 
-    Without outputs among the variables, an output is the sum of the effects of the flows.
+    The vector x holds all variables of `program`: outputs, if `with_outputs`, then flows,
+    pieces and moves. Without outputs among the variables, an output is expressed as the sum of
+    the effects of the flows. M is sparse.
     """
     n = len(program.flows.cost)
     rows = len(program.targets)
@@ -262,14 +301,28 @@ def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
 def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
     """Return the plan of a controller that never expects another change of the set point.
 
-    Where set points have no law (a square wave, a list), the only bound is the one with
-    preview: for one given sequence any controller may have the times of the changes built in.
-    The reference holds under a condition. At each change the controller takes, from where it
-    is, the flow that is best if the new set point stays. If the plant has settled by the next
-    change, each change costs the least that is possible without preview; see `plan`.
+    For set points that are not random (a square wave, a list), the only lower bound is the
+    bound for controllers with preview, as a controller may have the times of all changes built
+    in. The reference replaces a bound without preview. At each change of the set point, the
+    controller chooses the flow that is best if the new set point stays for ever. If the plant
+    has settled before the next change, each change causes the least error that is possible
+    without preview; see `plan`.
 
-    `setpoint` is y_d(k), degC, shape (samples,). The model covers `model.lag + TAIL` samples
-    more. A `NoBoundError` is raised if the plant has not settled at a change.
+    Parameters
+    ----------
+    model
+        The plant, for `model.lag + TAIL` samples more than `setpoint` has.
+    unknown
+        The lower bounds of E|m - n| for this plant; see `unknown.py`.
+    setpoint
+        Set points y_d(k), degC, shape (samples,).
+
+    Raises
+    ------
+    NoBoundError
+        If the plant has not settled when the set point changes.
+    RuntimeError
+        If no solver solves a linear program within `TIME_LIMIT`.
     """
     low, high = model.limits
     flow = np.zeros(0)

@@ -28,7 +28,11 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Examine the claims and write the verdicts, also where some examinations have failed."""
+    """Examine the claims, write the report and return the closing message for users.
+
+    If the examination of a claim fails, the error is raised after the report of the other
+    claims was written.
+    """
     from benchmarks.claims.claims import CLAIMS, examined
     from benchmarks.claims.findings import sections, table
     from benchmarks.claims.runs import Batch

@@ -1,7 +1,9 @@
 """Examine the paper's claims: the runs for each claim, and the criteria that it must meet.
 
-Each function below examines a claim, or two claims that differ in an argument: it takes a batch
-of runs and yields findings. `CLAIMS`, at the end, has the words of all claims.
+The paper is that of Cui and Shin (1992), whose controller is a neural network (NN) that learns
+online. A function that yields `Findings` examines a claim of the paper, or two claims that
+differ in an argument. Its argument `batch` says how many runs to make, and with which seeds.
+`CLAIMS`, at the end of the module, holds the words of all claims.
 """
 
 import itertools
@@ -23,20 +25,23 @@ from benchmarks.loop.scenarios import SETPOINTS as PAPER_SETPOINTS
 from benchmarks.loop.scenarios import Arguments, Scenario
 from mptc_gym import PRESETS, Parameters
 
-# The meaning of words, fixed before the numbers were known and the same for all claims.
-NOTABLE = 0.05  # a smaller relative change of an error is not notable
+# Numbers that give words of the claims a meaning. They were chosen before any run, and are the
+# same for all claims.
+NOTABLE = 0.05  # a relative change of an error below this share is not "notable"
 MUCH = 0.2  # "much better", "seriously worse": the error differs by at least this share
-SOON = 150  # samples; the paper's number for the convergence of the weights
+SOON = 150  # samples; the paper says that the weights converge within 150 sampling intervals
 
-LEVEL = 5.0  # degC, of the constant set point and of the square wave
-SAMPLES = 1200  # of a run, unless the case says otherwise
+LEVEL = 5.0  # degC, the constant set point, and the amplitude of the square wave
+SAMPLES = 1200  # length of a run, unless the case has another length
 LEARNING = 600  # samples after which a network counts as trained
 NOISY = PRESETS["noisy"]
 NOISY_SQUARE = "square wave, R = 0.5 °C²"
-# The constant set point comes first, as it shows initial learning alone.
+# The cases of the set point. The constant set point comes first: without later changes, its
+# error comes from initial learning alone.
 SETPOINTS = PAPER_SETPOINTS[::-1]
 CONSTANT, SQUARE = (setpoint.arguments for setpoint in SETPOINTS)
-# How a network of another shape learns, by whether its gains are scaled in proportion.
+# Words for the learning rates ("gains") of a network with more nodes or inputs than the paper's
+# network, by the argument `in_proportion` of `Batch.networks`.
 GAINS = {False: "the same gains", True: "gains in proportion"}
 PAPER_PI = Gains(2.2, 0.3)
 SEARCHED_PI = Gains(SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
@@ -45,7 +50,7 @@ Findings = Iterable[Finding]
 
 
 def convergence(batch: Batch) -> Findings:
-    """Measure when the weights of the paper's network converge."""
+    """Yield findings about the time after which the weights of the paper's network converge."""
     for setpoint in SETPOINTS:
         networks = batch.networks()
         log = WeightLog(networks)
@@ -64,7 +69,7 @@ def convergence(batch: Batch) -> Findings:
 
 
 def dead_zone(batch: Batch) -> Findings:
-    """Compare the network at dead zones of 5 and 7 t/h."""
+    """Compare the errors of the paper's network at dead zones of 5 and 7 t/h (half widths)."""
     for setpoint in SETPOINTS:
         title = setpoint.title
         small = batch.run_nn(setpoint.samples, **setpoint.arguments)
@@ -85,7 +90,10 @@ def dead_zone(batch: Batch) -> Findings:
 
 
 def noise(batch: Batch) -> Findings:
-    """Compare the network in noise with an idle valve, on the last 600 samples."""
+    """Compare the paper's network with an idle valve, on plants with noise.
+
+    At a constant set point, only the last 600 of 1,200 samples count, when learning is over.
+    """
     steady = slice(-600, None)
     idle_runs = batch.run_pi(Gains(0.0, 0.0), SAMPLES, setpoint=0.0, **NOISY)
     idle_deviation = idle_runs.output[steady].std(axis=0)
@@ -114,7 +122,11 @@ def noise(batch: Batch) -> Findings:
 
 
 def pi_gains(batch: Batch) -> Findings:
-    """Examine the paper's PI controller, and PI controllers with another Kp."""
+    """Examine the paper's PI controller, and PI controllers with another gain Kp.
+
+    The claim is that the paper's controller oscillates, that a lower Kp is not notably better,
+    and that a higher Kp makes the loop unstable.
+    """
     kp, ki = PAPER_PI
     runs = batch.run_pi(PAPER_PI, SAMPLES, **CONSTANT)
     yield judge(
@@ -159,16 +171,17 @@ def pi_gains(batch: Batch) -> Findings:
 
 
 def largest_pole(gains: Gains) -> float:
-    """Return the largest modulus of the poles of a PI controller with the paper's plant.
+    """Return the largest magnitude of a pole of the paper's plant with a PI controller.
 
-    The actuator is left out. The loop is stable if the modulus is below 1.
+    The closed loop is taken without the actuator's dead zone and limits. The loop is stable if
+    the magnitude is below 1.
     """
     plant = linear.nominal(Parameters())
     return linear.LinearLoop.of(PIController(*gains), plant).largest_pole()
 
 
 def against_pi(batch: Batch, gains: Gains) -> Findings:
-    """Compare the network with a PI controller that has these gains, in the same noise."""
+    """Compare the paper's network with a PI controller of these gains, in the same noise."""
     for noise_title, noise_arguments in (("", {}), (", R = 0.5 °C²", NOISY)):
         for setpoint in SETPOINTS:
             arguments = {**setpoint.arguments, **noise_arguments}
@@ -190,7 +203,11 @@ def against_pi(batch: Batch, gains: Gains) -> Findings:
 
 
 def direction(batch: Batch) -> Findings:
-    """Measure when networks that assume the wrong direction of the plant diverge."""
+    """Measure when networks that assume the wrong sign of the plant's gain diverge.
+
+    A run counts as diverged when the temperature exceeds 90 % of the largest deviation that the
+    limited flow can cause.
+    """
     runs = batch.run(batch.networks(direction=1), 600, **CONSTANT)
     plant = Parameters()
     reach = abs(linear.nominal(plant).gain) * plant.u_max  # degC that the flow can cause
@@ -212,7 +229,11 @@ def direction(batch: Batch) -> Findings:
 
 
 def other_shapes(batch: Batch, shapes: dict[str, dict[str, int]]) -> Findings:
-    """Compare networks of other shapes, arguments of `Batch.networks`, with the paper's."""
+    """Compare networks with more nodes or inputs with the paper's network.
+
+    `shapes` holds, for each shape of a network, a title and arguments of `Batch.networks`. Each
+    shape is examined with the paper's learning rates, and with rates scaled in proportion.
+    """
     noisy_square = Scenario("noisy-square", NOISY_SQUARE, SAMPLES, NOISY)
     for case in (*SETPOINTS, noisy_square):
         paper_errors = mean_error(batch.run_nn(case.samples, **case.arguments))
@@ -230,7 +251,10 @@ def other_shapes(batch: Batch, shapes: dict[str, dict[str, int]]) -> Findings:
 
 
 def reliability(batch: Batch) -> Findings:
-    """Compare networks of 3, 6 and 12 hidden nodes before and after the failure of a node."""
+    """Compare networks of 3, 6 and 12 hidden nodes, before and after the failure of a node.
+
+    After `LEARNING` samples, the output of one hidden node stays at 0 or at 1 for ever.
+    """
     for in_proportion, stuck_at in itertools.product(GAINS, (0, 1)):
         errors = {}  # after the failure, by the number of nodes
         for nodes in (3, 6, 12):
@@ -260,7 +284,11 @@ def reliability(batch: Batch) -> Findings:
 
 
 def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None:
-    """At k = `LEARNING`, let the output of a hidden node of each network stay at 0 or at 1."""
+    """Damage the first hidden node of each network at the sample k = `LEARNING`.
+
+    A rollout calls this function before each sample. The output of the damaged node stays at
+    `stuck_at`, 0 or 1, and the other nodes go on learning.
+    """
     if k == LEARNING:
         weights = networks.weights
         weights.W[..., 0, :] = 0.0
@@ -270,7 +298,11 @@ def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None
 
 
 def keep_learning(batch: Batch) -> Findings:
-    """Compare learning with frozen weights, both trained on the paper's plant, on others."""
+    """Compare learning and frozen networks on plants that differ from the training plant.
+
+    The networks learn on the paper's plant. Then the gain or the delay of the plant changes,
+    and the weights either continue to learn or stay as they are.
+    """
     networks = batch.networks()
     batch.run(networks, SAMPLES, **SQUARE)
     learnt_weights = networks.weights
@@ -298,11 +330,13 @@ def keep_learning(batch: Batch) -> Findings:
 
 
 def direction_only(batch: Batch) -> Findings:
-    """Measure how often the network settles on plants with other delays, gains and lags.
+    """Measure how often the paper's network settles on plants with other dynamics.
 
-    The flow that a set point needs depends on the gain. For 5 degC it lies beyond the limits if
-    the gain is below 0.74 of the paper's, and inside the dead zone if it is above 1.46. So the
-    set point is 5 degC on some plants, and 5 degC times the gain on others.
+    The plants differ from the paper's plant in delay, gain and time constant. The steady flow
+    for a set point of 5 degC lies beyond the actuator's limits if the gain is below 0.74 of the
+    paper's gain, and inside the dead zone if the gain is above 1.46 of the paper's gain. So
+    there are two series of runs: with a set point of 5 degC, and with a set point of 5 degC
+    times the gain factor.
     """
     fixed = plants_that_settle(batch, gains=(0.75, 1.0, 1.25, 1.4), is_scaled=False)
     scaled = plants_that_settle(batch, gains=(0.7, 1.0, 1.25, 1.5), is_scaled=True)
@@ -329,11 +363,25 @@ def direction_only(batch: Batch) -> Findings:
 def plants_that_settle(
     batch: Batch, gains: Iterable[float], *, is_scaled: bool
 ) -> pd.DataFrame:
-    """Run the network on plants of these gains, and return a row for each plant.
+    """Run the paper's network on plants with other dynamics, and return a row for each plant.
 
-    The columns are `constant` and `gain`, the factors of time constant and gain; `delay`,
-    samples; `runs`, whether each run settles, an array of shape (runs,); and `share`, the share
-    of runs that do. The set point is 5 degC, or 5 degC times the gain if it `is_scaled`.
+    The plants are all combinations of three time constants, four delays and these gains.
+
+    Parameters
+    ----------
+    batch
+        Number and seeds of the runs on each plant.
+    gains
+        Gains of the plants, as multiples of the paper's gain.
+    is_scaled
+        Whether the set point is 5 degC times the gain factor, in place of 5 degC.
+
+    Returns
+    -------
+    DataFrame
+        The columns are `constant` and `gain`, factors of the paper's time constant and gain;
+        `delay`, samples; `runs`, an array of shape (runs,) that says whether each run settles;
+        and `share`, the share of runs that settle.
     """
     rows = []
     for constant, gain, delay in itertools.product((0.5, 1.0, 2.0), gains, (9, 18, 27, 36)):
@@ -346,9 +394,10 @@ def plants_that_settle(
 
 
 def judge_worst(plants: pd.DataFrame, text: str) -> Finding:
-    """Judge the share of runs that settle on the plant on which this share is smallest.
+    """Return a finding about the plant on which the smallest share of runs settles.
 
-    `plants` are rows of `plants_that_settle`, and `text` says which.
+    `plants` are rows of what `plants_that_settle` returns, and `text` describes these plants in
+    words.
     """
     worst = plants.iloc[plants["share"].argmin()]
     quantity = (
@@ -359,17 +408,17 @@ def judge_worst(plants: pd.DataFrame, text: str) -> Finding:
 
 
 def figures(_: Batch) -> Findings:
-    """Yield nothing: the text does not say how the curves of the figures were made."""
+    """Return no findings: the paper does not say how the curves of its figures were made."""
     return ()
 
 
 class Claim(NamedTuple):
-    """A claim in a section of the paper, and the method by which it is examined."""
+    """A claim of the paper, and how the claim is examined."""
 
-    section: str
-    statement: str
-    method: str
-    examine: Callable[..., Findings]  # takes a `Batch`
+    section: str  # where the claim is in the paper
+    statement: str  # the claim in one sentence
+    method: str  # how the claim is examined, and what its words mean, for the report
+    examine: Callable[..., Findings]  # takes a `Batch`, and returns the findings
 
 
 CLAIMS = {
@@ -481,5 +530,8 @@ CLAIMS = {
 
 
 def examined(name: str, batch: Batch) -> list[Finding]:
-    """Return the findings about a claim, from runs of a batch."""
+    """Run the examination of a claim, and return all findings about the claim.
+
+    `name` is a key of `CLAIMS`, and `batch` gives the number of runs and their seeds.
+    """
     return list(CLAIMS[name].examine(batch))

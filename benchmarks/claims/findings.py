@@ -1,4 +1,4 @@
-"""Judge numbers by criteria, and write what is found about the claims as a report."""
+"""Judge measured numbers by the criteria of the paper's claims, and lay out the report."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import inf, isfinite, isinf
@@ -20,33 +20,35 @@ NOTE = (
     "confidence interval satisfies it. A claim holds if all its criteria are met, and it holds "
     "in part if some of its criteria are met."
 )
-OFTEN = 0.9  # "works", "converges": in at least this share of the runs
+# Least share of runs for claims such as "the controller works" or "the weights converge".
+OFTEN = 0.9
 
 
 def judge(
     quantity: str, value: Any, unit: str = "", *, at_least: float = -inf, at_most: float = inf
 ) -> Finding:
-    """Return a finding: a number, and whether it meets a criterion.
+    """Return a finding: a measured number, and whether the number meets a criterion.
 
     Parameters
     ----------
     quantity
-        What the number is, in words.
+        What was measured, in words.
     value
-        An `Estimate`; an array with a value for each run, of which the median is estimated; or
-        an exact number.
+        The number: an `Estimate`; or an array with a value for each run, shape (runs,), of
+        which the median is estimated; or an exact number.
     unit
         Unit of the number.
     at_least, at_most
-        Bounds that a claim asks for. Without a bound, the number is information, and no part of
-        the verdict.
+        Lower and upper bound of the number that a claim of the paper asks for. Without any
+        bound, the number is for information only, and does not count in the verdict.
 
     Returns
     -------
     dict
-        `quantity`, `unit`, the fields of the `Estimate`, `criterion` in words ("" without a
-        bound), and `shown`: "yes" if the entire interval satisfies the bounds, "no" if no part
-        of it does, otherwise "undecided"; "" without a bound.
+        `quantity`; `unit`; `value`, `low`, `high` and `runs` of the `Estimate`; `criterion`,
+        the bounds in words; and `shown`: "yes" if the entire 95 % interval satisfies the
+        bounds, "no" if the entire interval violates a bound, and otherwise "undecided". Without
+        a bound, `criterion` and `shown` are "".
     """
     if isinstance(value, Estimate):
         estimate = value
@@ -74,18 +76,27 @@ def judge(
 
 
 def judge_share(quantity: str, happened: NDArray[np.bool_], *, often: bool = False) -> Finding:
-    """Judge the share of runs in which something happened, shape (runs,).
+    """Return a finding about the share of runs in which something happened, in percent.
 
-    `often` asks for a share of at least `OFTEN`.
+    Parameters
+    ----------
+    quantity
+        What happened, in words.
+    happened
+        Whether it happened in each run, shape (runs,).
+    often
+        Whether the claim asks for a share of at least `OFTEN`. If not, the share is for
+        information only.
     """
     at_least = 100 * OFTEN if often else -inf
     return judge(quantity, share(happened).scaled(100), "% of runs", at_least=at_least)
 
 
 def judge_times(quantity: str, samples: ArrayLike) -> Iterator[Finding]:
-    """Yield the 10th, 50th and 90th percentile of times of the runs, as information.
+    """Yield findings without a criterion: the 10th, 50th and 90th percentile of a time.
 
-    `samples` has the shape (runs,); an infinite time means never.
+    `quantity` says in words which time was measured. `samples` holds the time in each run,
+    samples, shape (runs,); infinity means that the event never happened in the run.
     """
     for probability in (0.1, 0.5, 0.9):
         estimate = quantile(samples, probability)
@@ -93,7 +104,11 @@ def judge_times(quantity: str, samples: ArrayLike) -> Iterator[Finding]:
 
 
 def verdict(findings: Iterable[Finding]) -> str:
-    """Return the verdict in words; an undecided finding counts as not shown."""
+    """Return the verdict on a claim in words, from all findings about the claim.
+
+    Findings without a criterion do not count. An undecided finding counts as a criterion that
+    is not met.
+    """
     is_met = [finding["shown"] == "yes" for finding in findings if finding["shown"]]
     if not is_met:
         return "cannot be tested from the text"
@@ -105,9 +120,17 @@ def verdict(findings: Iterable[Finding]) -> str:
 
 
 def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) -> pd.DataFrame:
-    """Return one row for each finding about a claim, and one for a claim without findings.
+    """Return the table of all findings, with the verdicts on the claims.
 
-    Both arguments are by the names of the claims.
+    The table has a row for each finding about a claim. A claim without findings has one row, in
+    which `runs` is missing.
+
+    Parameters
+    ----------
+    claims
+        The claims by name, each with the attributes `section` and `statement`.
+    findings
+        The findings about each claim, by the name of the claim.
     """
     rows: list[dict[str, Any]] = []
     for name, findings_of_claim in findings.items():
@@ -124,9 +147,10 @@ def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) 
 
 
 def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
-    """Return the sections of the report: the verdicts, then the numbers of each claim.
+    """Return the sections of the report: a list of verdicts, then a section for each claim.
 
-    `claims` are the claims by name; `numbers` is what `table` returns.
+    `claims` are the claims by name, and `numbers` is the table of findings that `table`
+    returns.
     """
     verdicts = numbers.drop_duplicates("claim")[["statement", "verdict"]]
     report = [Section("", [NOTE], verdicts.rename(columns={"statement": "claim"}))]
@@ -141,7 +165,10 @@ def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
 
 
 def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of `table` as text, with the columns of the report."""
+    """Return findings as a table of text with the columns of the report.
+
+    `rows` are rows of what `table` returns, all with a measured number.
+    """
     low = rows["low"].map(_three_digits)
     high = rows["high"].map(_three_digits)
     columns = {
@@ -155,7 +182,10 @@ def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _three_digits(value: float) -> str:
-    """Return a number with about three digits; an infinite time is "never"."""
+    """Return a number as text with about three digits.
+
+    Infinity, the time of an event that did not happen, is "never"; minus infinity is "?".
+    """
     if isinf(value):
         return "never" if value > 0 else "?"
     if abs(value) >= 100:

@@ -1,4 +1,4 @@
-"""Run batches of the paper's network and of PI controllers, and log how weights converge."""
+"""Run batches of the paper's neural controller and of PI controllers, and log weights."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,25 +12,27 @@ from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 
 Array = NDArray[np.floating]
 
-PAPER_NODES = 3  # hidden nodes of the paper's network
-PAPER_LENGTH = 3  # set points, and errors, that the paper's network sees
-CONVERGED = 0.05  # share of the distance at the start within which weights have converged
-STAY = 100  # samples for which weights must stay converged at the end of a run
+PAPER_NODES = 3  # number of hidden nodes of the paper's network
+PAPER_LENGTH = 3  # number of set points, and of errors, among the inputs of the paper's network
+# Weights have converged if their distance from their final values is at most this share of the
+# distance at the start of the run, for at least the last `STAY` samples of the run.
+CONVERGED = 0.05
+STAY = 100
 
 
 class Gains(NamedTuple):
-    """The gains of a PI controller, t/h per degC; `ki` acts on the sum of the errors."""
+    """The gains of a PI controller, whose command is -kp e(k) - ki times the sum of errors."""
 
-    kp: float
-    ki: float
+    kp: float  # t/h per degC
+    ki: float  # t/h per degC and sample
 
 
 @dataclass(frozen=True)
 class Batch:
-    """A batch of runs; run i has the initial weights and noise of seed `seed + i`."""
+    """A batch of independent runs of controllers on plants."""
 
-    runs: int
-    seed: int = 0
+    runs: int  # number of runs
+    seed: int = 0  # run i has the initial weights and the noise of the seed `seed + i`
 
     def networks(
         self,
@@ -40,19 +42,20 @@ class Batch:
         in_proportion: bool = False,
         direction: int = -1,
     ) -> DirectNNController:
-        """Return a network for each run, by default the paper's.
+        """Return a learning network for each run of the batch, by default the paper's network.
 
         Parameters
         ----------
         nodes
             Number of hidden nodes.
         length
-            Number of set points, and of errors, that a network sees.
+            Number of set points, and of errors, among the inputs of a network.
         in_proportion
-            A sum moves faster the more terms it has, if the weights of all terms learn with the
-            same gain. True scales the gains down in proportion, to compensate.
+            Whether the learning rates are scaled by the paper's number of nodes, or inputs,
+            divided by the present number. With equal learning rates, a larger network learns
+            faster, as more terms of a sum change at the same time.
         direction
-            The sign of the plant's gain that a network assumes.
+            The sign of the plant's gain that a network assumes: -1, or 1 for the wrong sign.
         """
         node_scale = 1.0
         input_scale = 1.0
@@ -79,29 +82,48 @@ class Batch:
         before: Callable[[int], object] | None = None,
         **arguments: Any,
     ) -> Trajectory:
-        """Run a controller on plants with these arguments; for `before` see `rollout`."""
+        """Run a controller on a plant for each run of the batch, and return the trajectory.
+
+        Parameters
+        ----------
+        agent
+            The controller, for all runs of the batch.
+        samples
+            Length of a run.
+        before
+            Function that is called with k before the controller acts at sample k.
+        **arguments
+            Arguments of the environment.
+        """
         plants = make_plants(self.runs, samples, **arguments)
         return rollout(plants, agent, samples, self.seed, before)
 
     def run_nn(self, samples: int, **arguments: Any) -> Trajectory:
-        """Run the paper's networks on plants with these arguments of the environment."""
+        """Run the paper's network, and return the trajectory of all runs of the batch.
+
+        `samples` is the length of a run, and `arguments` those of the environment.
+        """
         return self.run(self.networks(), samples, **arguments)
 
     def run_pi(self, gains: Gains, samples: int, **arguments: Any) -> Trajectory:
-        """Run a PI controller on plants with these arguments; only one run if without noise."""
+        """Run a PI controller, and return its trajectory.
+
+        Without the argument `noise_variance`, all runs would be equal, so there is one run.
+        `samples` is the length of a run, and `arguments` those of the environment.
+        """
         batch = self if "noise_variance" in arguments else Batch(1, self.seed)
         return batch.run(PIController(*gains), samples, **arguments)
 
 
 @dataclass
 class WeightLog:
-    """The weights of a batch of networks, logged before each sample of a rollout."""
+    """A log of the weights of learning networks, to be called before each sample of a run."""
 
-    networks: DirectNNController
-    rows: list[Array] = field(default_factory=list)  # one per sample, shape (runs, weights)
+    networks: DirectNNController  # a batch of networks, one for each run
+    rows: list[Array] = field(default_factory=list)  # weights of a sample, (runs, weights)
 
     def __call__(self, k: int) -> None:
-        """Log the weights before sample k."""
+        """Append the present weights, those before the controller acts at sample k."""
         arrays = vars(self.networks.weights).values()
         columns = [array.reshape(len(array), -1) for array in arrays]
         self.rows.append(np.hstack(columns, dtype=np.float32))
@@ -110,10 +132,15 @@ class WeightLog:
 def converged_at(weights: Array) -> Array:
     """Return the sample from which on the weights of each run have converged, shape (runs,).
 
-    From this sample on, their Euclidean distance to their final values is at most `CONVERGED`
-    times the distance at the start. It is infinite for weights that come so close only in the
-    last `STAY` samples: they have not converged, as the run might end anywhere on their way.
-    `weights` are the weights before each sample, shape (samples, runs, weights).
+    From this sample on, the Euclidean distance of the weights from their final values is at
+    most `CONVERGED` times the distance at the start. Weights that come this close to their
+    final values only in the last `STAY` samples have not converged, as the run may end while
+    the weights are still moving; for such a run the result is infinite.
+
+    Parameters
+    ----------
+    weights
+        The weights of the networks before each sample, shape (samples, runs, weights).
     """
     samples = len(weights)
     distances = np.linalg.norm(weights - weights[-1], axis=2)

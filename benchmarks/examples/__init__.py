@@ -1,1 +1,1 @@
-"""Hold scripts to copy, which train policies."""
+"""Hold example scripts that train policies, each of which can be copied and changed."""

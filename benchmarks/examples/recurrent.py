@@ -4,8 +4,9 @@
     python -m benchmarks.compare --presets --scenarios hard --agents mpc \
         --agent mine=benchmarks.examples.recurrent:make
 
-The policy sees set points and errors alone. A gated recurrent unit has to find out what the
-plant is. Its last layer moves the flow, and past flows are among its inputs.
+`hard` is the preset of `MiddlePointHard-v0`, with plants that differ between episodes. The
+policy observes set point and error only, so a gated recurrent unit has to identify the plant.
+The last layer of the network changes the flow, and past flows are among the network's inputs.
 """
 
 import sys
@@ -20,16 +21,28 @@ from mptc_gym import IDS, PRESETS, evaluate
 from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
-FILE = Path("recurrent.pt")
-SAMPLES = 1200  # of an episode
-SEGMENT = 150  # samples that gradients reach back; a flow shows after up to 25
-TEMPERATURE = 5.0  # degC, which inputs are divided by
-LARGEST_MOVE = 0.4  # of half the actuator's range, per sample
-MEMORY = 26  # samples: flows that may be on their way to the output
+FILE = Path("recurrent.pt")  # the file of the trained network
+SAMPLES = 1200  # length of an episode
+# Samples that gradients reach back. A flow first shows in the output after up to 25 samples, so
+# a segment contains most of a flow's effect.
+SEGMENT = 150
+TEMPERATURE = 5.0  # temperatures are divided by this, degC, to be of order 1
+LARGEST_MOVE = 0.4  # largest change of the action per sample; half the actuator's range is 1
+# Number of past actions among the inputs: enough for all flows that have not yet shown in the
+# output, for the longest delay.
+MEMORY = 26
 
 
 class Recurrent(nn.Module):
-    """The policy of n loops with its state: from set points and errors to actions."""
+    """The policy's network for n control loops: from set points and errors to actions.
+
+    The state of the recurrent unit and the past actions are kept between samples.
+
+    Parameters
+    ----------
+    nodes
+        Number of nodes of the recurrent unit.
+    """
 
     def __init__(self, nodes: int = 64) -> None:
         super().__init__()
@@ -38,17 +51,20 @@ class Recurrent(nn.Module):
         self.begin(1)
 
     def begin(self, n: int) -> None:
-        """Forget the episode, and begin those of n plants at rest."""
+        """Set state and past actions to 0 for n plants at rest, before a new episode."""
         self.state = torch.zeros(n, self.cell.hidden_size)
         self.actions = torch.zeros(n, MEMORY)  # newest first
 
     def detach(self) -> None:
-        """Cut the graph that leads to earlier samples."""
+        """Cut the PyTorch graph, so that later gradients do not reach earlier samples."""
         self.state = self.state.detach()
         self.actions = self.actions.detach()
 
     def forward(self, setpoint: Tensor, error: Tensor) -> Tensor:
-        """Return actions, shape (n, 1), for set points and errors of a sample, degC, (n,)."""
+        """Return the actions of a sample, shape (n, 1), and update the state.
+
+        `setpoint` and `error` are the set points and the measured errors, degC, shape (n,).
+        """
         measured = torch.stack([setpoint, error], dim=1) / TEMPERATURE
         inputs = torch.cat([measured, self.actions], dim=1)
         self.state = self.cell(inputs, self.state)
@@ -59,18 +75,30 @@ class Recurrent(nn.Module):
 
 
 class Policy:
-    """The trained policy in the form that `evaluate` and `compare` take: `reset`, `act`."""
+    """A trained network as a policy with the methods `reset` and `act`.
+
+    `mptc_gym.evaluate` and the command `benchmarks.compare` accept such policies.
+
+    Parameters
+    ----------
+    network
+        The trained network.
+    """
 
     def __init__(self, network: Recurrent) -> None:
         self._network = network
         self._begun = False
 
     def reset(self) -> None:
-        """Forget the episode."""
+        """Prepare for a new episode: the next call of `act` resets the network's state."""
         self._begun = False
 
     def act(self, observations: Any) -> np.ndarray[Any, Any]:
-        """Return actions, shape (n, 1), for observations, (n, size)."""
+        """Return the actions of a sample, shape (n, 1).
+
+        `observations` has the shape (n, size): equal numbers of latest set points and latest
+        errors, degC, newest first.
+        """
         seen = torch.as_tensor(np.asarray(observations), dtype=torch.float32)
         if not self._begun:
             self._network.begin(len(seen))
@@ -82,7 +110,17 @@ class Policy:
 
 
 def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
-    """Train by truncated backpropagation through the plants, and return the network."""
+    """Train a network by truncated backpropagation through the plants, and return it.
+
+    Parameters
+    ----------
+    steps
+        Number of steps of the optimiser, each from a segment of `SEGMENT` samples.
+    plants
+        Number of plants that are simulated together.
+    seed
+        Seed of the initial weights.
+    """
     torch.manual_seed(seed)
     network = Recurrent()
     optimiser = torch.optim.Adam(network.parameters())
@@ -101,7 +139,7 @@ def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
         for _ in range(SEGMENT):
             actions = network(observations[:, 0], observations[:, 1])
             observations, _, _, _, infos = env.step(actions)
-            errors.append(infos["error"])  # the true one; the observed one has noise
+            errors.append(infos["error"])  # without the noise of the observed error
         loss = nn.functional.huber_loss(
             torch.stack(errors), torch.zeros(SEGMENT, plants), delta=0.1
         )
@@ -114,7 +152,11 @@ def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
 
 
 def make() -> Policy:
-    """Return the saved policy, as `--agent NAME=MODULE:FACTORY` of `compare` calls it."""
+    """Return the policy that is saved in `FILE`.
+
+    The command `benchmarks.compare` calls this function for its option
+    `--agent mine=benchmarks.examples.recurrent:make`.
+    """
     network = Recurrent()
     network.load_state_dict(torch.load(FILE, weights_only=True))
     return Policy(network)

@@ -1,20 +1,23 @@
 """Train PPO of Stable-Baselines3 to control the plant, in a quarter of a minute on one core.
 
-`python benchmarks/examples/sb3.py` trains a policy, saves it in `ppo-0.zip`, and prints its
-scores: 0 is a valve left alone, 1 the least possible error.
+`python benchmarks/examples/sb3.py` trains a policy, saves the policy in `ppo-0.zip`, and prints
+its scores. A score of 0 is that of an idle valve, and a score of 1 means the least possible
+error.
 
-Copy this one file; `benchmarks/train/ppo.py` is built on it. The training works for these
-reasons:
+This file can be copied without any other file; `benchmarks/train/ppo.py` imports it. The
+training works for the following reasons:
 
-- **Groups.** Eight plants meet the same noise and set points, and differ only in the actions
-  that they explore. Without the mean of the group, advantages have much less variance.
-- **Changes.** The policy sees the error and changes, but no levels, and has no biases. The
-  policy is at rest only where the error is 0, so it has no offset, and acts at -5 degC as at
-  +5 degC.
-- **Exploration that falls.** The standard deviation of the actions follows a schedule, as it
-  stays high if it is learnt.
-- **Changes of the flow.** The action changes the flow (`IncrementalAction`, which also
-  compensates the dead zone).
+- **Groups.** Eight plants have the same noise and set points, and differ only in the random
+  part of their actions. The mean over a group is subtracted from the advantages of its plants,
+  which makes the variance of the advantages much smaller.
+- **Changes as inputs.** The policy's inputs are the error, and changes of set point,
+  temperature and flow, but not the values of set point, temperature and flow. The policy has no
+  biases. So the policy keeps the flow constant only if the error is 0, which means no steady
+  error, and behaves in the same way at temperatures of -5 degC and +5 degC.
+- **Less and less exploration.** The standard deviation of the actions falls by a schedule. A
+  standard deviation that is learnt stays too high.
+- **Changes of the flow as actions.** The action changes the flow (wrapper `IncrementalAction`,
+  which also compensates the dead zone).
 """
 
 import argparse
@@ -33,16 +36,18 @@ from torch import Tensor, nn
 from mptc_gym import evaluate
 from mptc_gym.sb3 import make_vec_env, save, spec_of
 
-GROUP = 8  # plants that meet the same noise and set points
+GROUP = 8  # number of plants that have the same noise and set points
+# Arguments of the class `PPO`.
 SETTINGS: dict[str, Any] = {
-    "n_steps": 64,  # samples per plant between updates
+    "n_steps": 64,  # samples per plant between two updates of the policy
     "batch_size": 4096,
     "n_epochs": 5,
-    "gamma": 0.96,  # per sample
-    # Below 1, the value function would also stand in for effects of actions that the delay
-    # still holds back.
+    "gamma": 0.96,  # discount factor per sample
+    # With a lambda below 1, an advantage would partly rest on the value function for rewards
+    # that an action affects only after the delay.
     "gae_lambda": 1.0,
 }
+# Arguments of the environment that determine the observation.
 WINDOWS = {"setpoint_window": 3, "error_window": 1, "output_window": 64, "action_window": 64}
 PLANTS: dict[str, Any] = {
     "wrapper": {"max_move": 2.0, "compensate_dead_zone": True},
@@ -56,10 +61,20 @@ PLANTS: dict[str, Any] = {
 
 
 def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
-    """Return the error and the changes of set point, temperature and flow, of order 1.
+    """Return the inputs of the networks: the error, and changes of the other signals.
 
-    `observations` have the shape (n, size), with the `windows` of setpoints, errors, outputs
-    and actions in this order, by length. There are n rows of inputs.
+    Parameters
+    ----------
+    observations
+        Observations of the environment, shape (n, size): latest set points, errors, outputs and
+        actions, in this order, each newest first.
+    windows
+        The numbers of set points, errors, outputs and actions in an observation, in this order.
+
+    Returns
+    -------
+    Tensor
+        Inputs of order 1, with a row for each observation, shape (n, inputs).
     """
     setpoints, errors, outputs, actions = observations.split([*windows.values()], dim=1)
     scaled_changes = [
@@ -71,10 +86,22 @@ def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
 
 
 def changes(window: Tensor, single: int) -> Tensor:
-    """Return the differences between means over stretches of a window, newest first.
+    """Return the changes of a signal between successive stretches of its past.
 
-    The window has the shape (n, length). The newest stretches have one sample each, and there
-    are `single` of them; the older stretches have 2, 4, 8 and so on.
+    A change is the mean over a stretch minus the mean over the next older stretch.
+
+    Parameters
+    ----------
+    window
+        Past samples of a signal for n plants, newest first, shape (n, length).
+    single
+        Number of newest stretches that are one sample long. The older stretches have 2, 4, 8
+        samples and so on, and the oldest stretch has the remaining samples.
+
+    Returns
+    -------
+    Tensor
+        The changes, newest first, shape (n, stretches - 1).
     """
     lengths = [1] * single
     while remaining := window.shape[1] - sum(lengths):
@@ -84,30 +111,51 @@ def changes(window: Tensor, single: int) -> Tensor:
 
 
 class Changes(BaseFeaturesExtractor):
-    """Extract the inputs of the networks: see `inputs`."""
+    """The feature extractor that computes the inputs of policy and value function by `inputs`.
+
+    Parameters
+    ----------
+    space
+        The observation space.
+    """
 
     def __init__(self, space: Any) -> None:
         super().__init__(space, features_dim=49)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Return the inputs, one row per observation, shape (n, 49)."""
+        """Return the inputs of the networks for observations of shape (n, size), (n, 49)."""
         return inputs(observations, WINDOWS)
 
 
 class GroupBuffer(RolloutBuffer):
-    """Rollouts whose advantages are relative to the mean of a plant's group."""
+    """A rollout buffer whose advantages are relative to the mean over a group of plants.
+
+    `GROUP` successive plants, which have the same noise and set points, form a group.
+    """
 
     def compute_returns_and_advantage(self, last_values: Tensor, dones: Any) -> None:
-        """Compute returns as usual, and advantages relative to those of the group."""
+        """Compute returns and advantages, and subtract the groups' means from the advantages.
+
+        The arguments are those of `RolloutBuffer`: the values of the observations after the
+        last sample, and whether the episodes ended there.
+        """
         super().compute_returns_and_advantage(last_values, dones)
         groups = self.advantages.reshape(self.buffer_size, -1, GROUP)
         groups -= groups.mean(axis=2, keepdims=True)
 
 
 class Exploration(BaseCallback):
-    """Move the logarithm of the actions' standard deviation from `first` to `last`.
+    """A callback that lowers the standard deviation of the actions during the training.
 
-    It changes in proportion to the samples of experience.
+    The natural logarithm of the standard deviation changes linearly with the number of samples
+    of experience.
+
+    Parameters
+    ----------
+    first
+        The natural logarithm at the start of the training.
+    last
+        The natural logarithm at the end of the training.
     """
 
     def __init__(self, first: float, last: float) -> None:
@@ -125,9 +173,16 @@ class Exploration(BaseCallback):
 
 
 def make_ppo(plants: VecEnv, seed: int, **policy: Any) -> PPO:
-    """Return an untrained model for these plants, whose policy has no biases.
+    """Return an untrained PPO model whose policy has no biases.
 
-    `policy` holds arguments of the policy's class.
+    Parameters
+    ----------
+    plants
+        The training plants, in groups of `GROUP`.
+    seed
+        Seed of the initial weights, the exploration and the plants.
+    **policy
+        Arguments of the policy's class, `policy_kwargs` of Stable-Baselines3.
     """
     model = PPO(
         "MlpPolicy",

@@ -22,11 +22,13 @@ from mptc_gym import IDS, evaluate
 from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.sb3 import make_vec_env, spec_of
 
-EPISODES: Final = 100  # of a score
-SCORES: Final = 4  # of a training, at equal intervals of time
-# What the policies observe: a stretch of the past that is longer than the longest delay.
+EPISODES: Final = 100  # number of episodes over which a score is averaged
+SCORES: Final = 4  # number of scores in a training, at equal intervals of processor time
+# Arguments of the environment that determine the observation: the set point, eight errors, and
+# past actions over a time that is longer than the longest delay.
 WINDOWS: Final = {"setpoint_window": 1, "error_window": 8, "action_window": 31}
-# The class, the number of plants, and the settings that differ from the defaults.
+# For each algorithm its class, the number of plants that are simulated together, and arguments
+# of the class that differ from its defaults.
 ALGORITHMS: Final[dict[str, tuple[Any, int, dict[str, Any]]]] = {
     "ppo": (PPO, 64, {"n_steps": 64, "batch_size": 1024}),
     "recurrent-ppo": (RecurrentPPO, 64, {"n_steps": 64, "batch_size": 1024}),
@@ -37,16 +39,18 @@ POLICIES: Final = {"recurrent-ppo": "MlpLstmPolicy"}  # the others have "MlpPoli
 
 
 class Curve(BaseCallback):
-    """Score a policy at equal intervals of time, and stop the training after the last score.
+    """A callback that scores a policy during its training, at equal intervals of time.
+
+    After the last score, the callback stops the training.
 
     Parameters
     ----------
     seconds
-        Processor time of the training, without that of the scores.
+        Processor time of the training, without the time for the scores, s.
     row
-        What every row of the file begins with, by column.
+        Values for the first columns of each row in the CSV file, by column.
     path
-        The CSV file, to which rows are added.
+        The CSV file, to which a row is appended for each score.
     """
 
     def __init__(self, seconds: float, row: dict[str, Any], path: Path) -> None:
@@ -58,6 +62,7 @@ class Curve(BaseCallback):
         self._began = time.process_time()
 
     def _on_step(self) -> bool:
+        """Score the policy if it is time, and return whether to go on with the training."""
         spent = time.process_time() - self._began
         if spent < self._seconds * (self._scores + 1) / SCORES:
             return True
@@ -66,7 +71,10 @@ class Curve(BaseCallback):
         return self._scores < SCORES
 
     def _score(self, spent: float) -> None:
-        """Score the policy after `spent` seconds of training, and add the row."""
+        """Score the policy on validation episodes, and append a row to the CSV file.
+
+        `spent` is the processor time of the training so far, s.
+        """
         self._scores += 1
         spec = spec_of(self.model, IDS["hard"])
         result = evaluate(self.model, spec, episodes=EPISODES, seed=VALIDATION_SEED)
@@ -88,7 +96,19 @@ class Curve(BaseCallback):
 
 
 def train(algorithm: str, seed: int, minutes: float, path: Path) -> None:
-    """Train a policy for some minutes of processor time, and add its scores to a CSV file."""
+    """Train a policy for some processor time, and append its scores to a CSV file.
+
+    Parameters
+    ----------
+    algorithm
+        Key of `ALGORITHMS`.
+    seed
+        Seed of the initial weights, the exploration and the plants.
+    minutes
+        Processor time of the training, without the time for the scores.
+    path
+        The CSV file.
+    """
     kind, n, settings = ALGORITHMS[algorithm]
     plants = make_vec_env(
         IDS["hard"],
@@ -105,7 +125,7 @@ def train(algorithm: str, seed: int, minutes: float, path: Path) -> None:
 
 
 def main() -> None:
-    """Read the arguments, and train."""
+    """Read the command line, and train a policy."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("algorithm", choices=ALGORITHMS)
     parser.add_argument("--seed", type=int, default=0)

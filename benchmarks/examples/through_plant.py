@@ -22,15 +22,23 @@ WINDOWS: Any = {
     "action_window": 24,
 }
 SETPOINTS: Any = {"setpoint": "random", "setpoint_amplitude": 6.0, "setpoint_period": 400}
-# Action that holds a temperature, per degC: the plant's gain is -0.6825 degC per t/h, and an
-# action of 1 is a flow of 10 t/h.
+# Constant action that keeps the temperature at 1 degC in steady state: the plant's gain is
+# -0.6825 degC per t/h, and an action of 1 is a flow of 10 t/h.
 HOLDS = -0.1465
 
 
 def act(network: nn.Module, observations: Tensor) -> Tensor:
-    """Return actions, shape (n, 1), for observations, shape (n, 49).
+    """Return the actions of the policy for n plants, shape (n, 1).
 
-    The inputs of the network are all 0 in steady state at the set point.
+    An action is the constant action for the set point plus the network's output. All inputs of
+    the network are 0 if the output has been at the set point in steady state for 24 samples.
+
+    Parameters
+    ----------
+    network
+        The network, from 48 inputs to one output.
+    observations
+        The set point, 24 outputs and 24 actions of each plant, shape (n, 49).
     """
     setpoint, outputs, actions = observations.split([1, 24, 24], dim=1)
     inputs = torch.cat([0.5 * (setpoint - outputs), actions - HOLDS * setpoint], dim=1)
@@ -39,7 +47,19 @@ def act(network: nn.Module, observations: Tensor) -> Tensor:
 
 
 def run(network: nn.Module, plants: MiddlePointTorchEnv, samples: int, seed: int) -> Tensor:
-    """Return the errors of n plants in a run, degC, shape (samples, n)."""
+    """Run the policy on n plants from rest, and return the errors, degC, shape (samples, n).
+
+    Parameters
+    ----------
+    network
+        The network of the policy.
+    plants
+        The environment of n plants.
+    samples
+        Length of the run.
+    seed
+        Seed of the environment's reset, which determines the set points.
+    """
     observations, _ = plants.reset(seed=seed)
     errors = []
     for _ in range(samples):
@@ -49,10 +69,16 @@ def run(network: nn.Module, plants: MiddlePointTorchEnv, samples: int, seed: int
 
 
 def main(steps: int = 100, plants: int = 64, samples: int = 300) -> Evaluation:
-    """Train a policy, and return its evaluation on the square wave.
+    """Train a policy, and return its evaluation on the paper's square wave of set points.
 
-    The policy is trained in `steps` updates, each from a run of `samples` samples of `plants`
-    plants.
+    Parameters
+    ----------
+    steps
+        Number of updates of the network's weights, each from one run.
+    plants
+        Number of plants in a run.
+    samples
+        Length of a run.
     """
     torch.manual_seed(0)
     layers = nn.Linear(48, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)

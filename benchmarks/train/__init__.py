@@ -1,1 +1,1 @@
-"""Train the networks of the package."""
+"""Train the neural networks that come with the project."""

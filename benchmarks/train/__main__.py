@@ -13,8 +13,8 @@ from benchmarks.lib.results import KeptResults, conditions_of, results_folder
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.scenarios import PlantOptions
 
-SEED = SEEDS["networks"].first  # of the first network; the others follow
-# Modules with the recipes.
+SEED = SEEDS["networks"].first  # seed of the first network; network i has the seed SEED + i
+# For each kind of network, the module of `benchmarks.train` that has its recipe.
 NETWORKS = {"neural": "neural", "ppo": "ppo", "ppo-hard": "ppo"}
 
 
@@ -39,7 +39,10 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Train networks, save them and show their results in validation."""
+    """Train networks, save them, print their validation and return the closing message.
+
+    A `UsageError` is raised if the options name a plant for a network other than "ppo".
+    """
     name = options.network
     module = importlib.import_module(f"benchmarks.train.{NETWORKS[name]}")
     recipe = module.RECIPES[name]
@@ -66,12 +69,15 @@ def work(options: Options) -> str:
 
 
 def save_network(path: Path, network: Any) -> None:
-    """Save a network in a file."""
+    """Save a network by its method `save` in the file `path`."""
     network.save(path)
 
 
 def show_validation(networks: Mapping[int, Any]) -> None:
-    """Print the validation of networks, by seed."""
+    """Print a table with the validation results of trained networks, a row for each network.
+
+    `networks` has the networks by the seeds of their training.
+    """
     import pandas as pd
 
     from benchmarks.lib.report import on_screen

@@ -1,14 +1,16 @@
-"""Train the network of the self-tuning law by the gradient through random plants.
+"""Train the network that corrects the self-tuning controller, by gradients through plants.
 
-The error of a run is differentiated with respect to the weights, back through plant, actuator
-and law. The literature calls this differentiable predictive control (J. Drgona et al.,
-"Differentiable predictive control: deep learning alternative to explicit model predictive
-control for unknown nonlinear systems", Journal of Process Control 116, 2022, 80-92).
+The control error is differentiated with respect to the network's weights, back through plant,
+actuator and control law. The literature calls this training differentiable predictive control
+(J. Drgona et al., "Differentiable predictive control: deep learning alternative to explicit
+model predictive control for unknown nonlinear systems", Journal of Process Control 116, 2022,
+80-92).
 
-Two things make it quick. Only what depends on the flows has a gradient: the bank of models and
-all that it learns are NumPy, and constant to the optimiser. And the loss is an expectation: the
-error at k depends on commands up to k - d - 1, so noise and changes of the set point after
-these samples are averaged by formula, instead of by chance.
+The training is fast for two reasons. Only the control law and the plant have gradients: the
+bank of models and its estimates are computed in NumPy, and count as constants. And the loss is
+an expected error: the error at sample k depends on commands up to k - d - 1, for the plant's
+delay d, so noise and changes of the set point after the sample k - d - 1 are averaged by a
+formula and not by random samples.
 """
 
 import copy
@@ -34,54 +36,68 @@ from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 load = RecurrentNetwork.load
-LEAST_NOISE = 0.05  # degC; below it the expected error is rounded at 0, where |e| has a kink
+# Least standard deviation of the noise in the expected error, degC. For plants with little
+# noise, it rounds the kink of |e| at 0.
+LEAST_NOISE = 0.05
 
 
 @dataclass(frozen=True)
 class Training:
-    """Everything that shapes the network, except versions and code."""
+    """The settings of a training of the network."""
 
-    steps: int = 1000  # of the optimiser
-    plants: int = 128  # of a step
-    segment: int = 100  # samples that a step runs and differentiates through
-    hard_share: float = 0.6  # of the plants that are like those of `hard`
-    nodes: int = 32  # of the recurrent unit
-    hidden: int = 24  # nodes of the layer behind it
-    learning_rate: float = 0.005  # of Adam at first; it falls linearly to a fiftieth
-    largest_gradient: float = 0.3  # norm to which gradients are clipped
-    averaging: float = 0.99  # factor of the running mean of the weights, which is kept
-    validation_episodes: int = 200
+    steps: int = 1000  # number of steps of the optimiser
+    plants: int = 128  # number of plants in each step
+    segment: int = 100  # samples that a step simulates and differentiates through
+    hard_share: float = 0.6  # share of the plants that are like those of the preset `hard`
+    nodes: int = 32  # number of nodes of the recurrent unit
+    hidden: int = 24  # number of nodes of the hidden layer after the recurrent unit
+    learning_rate: float = 0.005  # of Adam at first; it falls linearly to 1/50 of this
+    largest_gradient: float = 0.3  # norm to which the gradient of a step is clipped
+    averaging: float = 0.99  # factor per step of the exponential mean of the weights
+    validation_episodes: int = 200  # number of episodes of the validation
 
 
-RECIPES = {"neural": Training()}  # as published
+RECIPES = {"neural": Training()}  # the settings of the published networks
 
 
 class Net(nn.Module):
-    """The network of `agents.RecurrentNetwork` in PyTorch, with the state of n loops."""
+    """The network of `agents.RecurrentNetwork` in PyTorch, with the state of n control loops.
+
+    Parameters
+    ----------
+    nodes
+        Number of nodes of the recurrent unit.
+    hidden
+        Number of nodes of the hidden layer.
+    """
 
     def __init__(self, nodes: int, hidden: int) -> None:
         super().__init__()
         self.cell = nn.GRUCell(INPUTS, nodes)
         self.hidden = nn.Linear(INPUTS + nodes, hidden)
         self.output = nn.Linear(hidden + INPUTS, OUTPUTS)
-        with torch.no_grad():  # so that the law is nearly linear at first
+        with torch.no_grad():  # small corrections, so that the law is nearly linear at first
             self.output.weight.mul_(0.1)
             self.output.bias.zero_()
         self.state = torch.zeros(0, nodes)
 
     def begin(self, n: int) -> None:
-        """Forget the loops, and begin with n at rest."""
+        """Set the state to 0 for n control loops at rest, before a new episode."""
         self.state = torch.zeros(n, self.cell.hidden_size)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return corrections of the law, shape (n, OUTPUTS), for inputs, (n, INPUTS)."""
+        """Return the corrections of the control law at a sample, and update the state.
+
+        `inputs` are those of `agents.law`, shape (n, INPUTS), and the corrections have the
+        shape (n, OUTPUTS).
+        """
         self.state = self.cell(inputs, self.state)
         hidden = nn.functional.silu(self.hidden(torch.cat([inputs, self.state], dim=1)))
         corrections: Tensor = self.output(torch.cat([hidden, inputs], dim=1))
         return corrections
 
     def export(self, **provenance: Any) -> RecurrentNetwork:
-        """Return the network in NumPy."""
+        """Return a copy of the network in NumPy, with `provenance`: how it was trained."""
         names = {
             "input": (self.cell.weight_ih, self.cell.bias_ih),
             "state": (self.cell.weight_hh, self.cell.bias_hh),
@@ -96,7 +112,21 @@ class Net(nn.Module):
 
 
 class Loops:
-    """Plants under the law, from rest, in segments that gradients do not leave."""
+    """A batch of plants under the control law, simulated from rest in segments of samples.
+
+    Gradients do not pass from a segment to the segment before.
+
+    Parameters
+    ----------
+    plants
+        The differentiable environment.
+    batch
+        Plant numbers, set points and noise of an episode, and what controllers know.
+    net
+        The network that corrects the control law.
+    seed
+        Seed of the environment's reset, for all that `batch` does not determine.
+    """
 
     def __init__(self, plants: MiddlePointTorchEnv, batch: Batch, net: Net, seed: int) -> None:
         self._plants = plants
@@ -111,7 +141,15 @@ class Loops:
         self._observations, self._infos = plants.reset(seed=seed, options=options)
 
     def run(self, samples: int) -> tuple[Tensor, Tensor]:
-        """Return true outputs, degC, shape (samples, n), and time-constant factors, (n,)."""
+        """Simulate the next segment of `samples` samples.
+
+        Returns
+        -------
+        outputs : Tensor
+            Outputs without noise of the transmitter, degC, shape (samples, n).
+        time_constant_factors : Tensor
+            Time constants at the end of the segment, as multiples of the paper's, shape (n,).
+        """
         self._plants.detach()
         self._law.detach()
         self._net.state = self._net.state.detach()
@@ -128,7 +166,22 @@ class Loops:
 
 
 def noise_response(time_constant_factors: Tensor, samples: int) -> Tensor:
-    """Return the response of n(k) in (28) to xi, C / A, shape (samples, n)."""
+    """Return the impulse response of C / A, from the noise xi to the output.
+
+    A and C are the polynomials of the plant, equation (28) of the paper.
+
+    Parameters
+    ----------
+    time_constant_factors
+        Time constants of n plants, as multiples of the paper's, shape (n,).
+    samples
+        Length of the impulse response.
+
+    Returns
+    -------
+    Tensor
+        Shape (samples, n).
+    """
     pole = 1.0 - (1.0 - POLE) / time_constant_factors
     response: list[Tensor] = []
     for lag in range(samples):
@@ -144,16 +197,30 @@ def noise_response(time_constant_factors: Tensor, samples: int) -> Tensor:
 
 
 def chance_of_change(ages: Tensor, samples: Tensor) -> Tensor:
-    """Return the probability that a random set point changes within the next samples."""
+    """Return the probability that a random set point changes within the next samples.
+
+    Parameters
+    ----------
+    ages
+        Number of samples since the last change of the set point.
+    samples
+        Number of future samples; the shapes of both arguments broadcast.
+    """
     shortest, longest = HOLDS
+    # Among the `possible` hold times of the present level, all equally probable, those that end
+    # within the next samples are `ending`.
     earliest = ages.clamp(min=shortest - 1.0)
-    possible = (longest - earliest).clamp(min=1.0)  # lengths, of which these end the level:
+    possible = (longest - earliest).clamp(min=1.0)
     ending = (ages + samples).clamp(max=longest) - earliest
     return (ending / possible).clamp(0.0, 1.0)
 
 
 def mean_distance(distances: Tensor, deviations: Tensor) -> Tensor:
-    """Return the mean of |x + z| for normal z with these standard deviations."""
+    """Return the mean of |x + z| for numbers x and normal random numbers z with the mean 0.
+
+    `distances` are the numbers x, and `deviations` the standard deviations of z. The shapes of
+    both broadcast.
+    """
     ratios = distances / deviations
     density = math.sqrt(2.0 / math.pi) * torch.exp(-0.5 * ratios.square())
     return deviations * density + distances * torch.erf(ratios / math.sqrt(2.0))
@@ -162,11 +229,24 @@ def mean_distance(distances: Tensor, deviations: Tensor) -> Tensor:
 def expected_error(
     outputs: Tensor, batch: Batch, time_constant_factors: Tensor, first: int
 ) -> Tensor:
-    """Return the mean of |e(k)| that was to be expected when its commands were chosen, degC.
+    """Return the loss: the mean over samples and plants of the expected |e(k)|, degC.
 
-    `outputs`, shape (samples, n), are those from k = `first` on. The last command that reaches
-    y(k) is that of k - d - 1. Since then xi has added normal noise to y(k), which is taken out
-    again, and the set point may have changed to a level that is uniform in its range.
+    The error e(k) is the set point minus the output y(k). The last command that affects y(k) is
+    that of the sample k - d - 1, where d is the plant's delay. The expectation of |e(k)| is
+    that at the sample k - d - 1: the effect of later noise xi on y(k) is subtracted, and
+    replaced by a normal distribution; and the set point may change after k - d - 1 to a level
+    that is uniformly distributed.
+
+    Parameters
+    ----------
+    outputs
+        The simulated outputs from k = `first` on, degC, shape (samples, n).
+    batch
+        Plant numbers, set points and noise of the episode.
+    time_constant_factors
+        Present time constants, as multiples of the paper's, shape (n,).
+    first
+        The sample k of the first output.
     """
     samples, n = outputs.shape
     delays = batch.numbers["delay"]
@@ -195,7 +275,11 @@ def expected_error(
 
 
 def validate(network: RecurrentNetwork, episodes: int) -> dict[str, float]:
-    """Return mean error, degC, and valve travel, t/h, on validation episodes of `hard`."""
+    """Return the mean error, degC, and the valve travel, t/h, of a network by name.
+
+    The network corrects the self-tuning controller on `episodes` validation episodes of the
+    environment `MiddlePointHard-v0`.
+    """
     plant = Parameters(**PRESETS["hard"])
     known = knowledge(BANK, plant, episodes, VALIDATION_SEED)
     controller = with_bank(NeuralSelfTuningController, network=network, **known)
@@ -206,7 +290,18 @@ def validate(network: RecurrentNetwork, episodes: int) -> dict[str, float]:
 def train(
     training: Training, seed: int, watch: Callable[[int, Net], object] | None = None
 ) -> RecurrentNetwork:
-    """Train and return the network; `watch` gets each step and the mean of the weights."""
+    """Train a network, and return it with the results of its validation.
+
+    Parameters
+    ----------
+    training
+        The settings of the training.
+    seed
+        Seed of the initial weights, the plants, and their set points and noise.
+    watch
+        Function that is called after each step of the optimiser, with the number of steps so
+        far and the network that has the running mean of the weights.
+    """
     torch.set_num_threads(1)  # the network is too small for more
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -229,7 +324,10 @@ def optimise(
     seed: int,
     watch: Callable[[int, Net], object] | None = None,
 ) -> Net:
-    """Train a network, and return the running mean of its weights."""
+    """Train a network in place, and return a network with the running mean of its weights.
+
+    `net` is the untrained network, and the other arguments are those of `train`.
+    """
     mean = copy.deepcopy(net)
     optimiser = torch.optim.Adam(net.parameters())
     sampler = Sampler(training.plants, training.hard_share, seed)

@@ -1,4 +1,4 @@
-"""Sample plants to train on, with set points, noise and what a controller knows of them."""
+"""Make random plants to train on, with set points, noise and a controller's prior knowledge."""
 
 import math
 from dataclasses import dataclass
@@ -14,16 +14,20 @@ from agents.self_tuning import CLEARANCE, CONSTANT_SPREAD, GAIN_SPREAD, TIME_CON
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
-SAMPLES: Final = 1200  # of an episode
-PAPER: Final = Parameters()
-GAIN: Final = abs(sum(PAPER.b) / sum(PAPER.a))  # degC per t/h
-POLE: Final = float(np.abs(np.roots(PAPER.a)).max())  # of the dominant time constant
-HALF_RANGE: Final = (PAPER.range_of("u_max")[1] - PAPER.range_of("u_min")[0]) / 2.0  # t/h
-HARD: Final = PRESETS["hard"]
-HOLDS: Final = (100, 300)  # samples, lengths of the levels of a random set point
-UNCHANGED: Final = 1e30  # samples, for which a set point is held that does not change by chance
-DELAYS: Final = 13  # in the bank of each plant
-# Ranges of the environment's arguments; every episode gets its own numbers within them.
+SAMPLES: Final = 1200  # length of an episode
+PAPER: Final = Parameters()  # the paper's plant
+GAIN: Final = abs(sum(PAPER.b) / sum(PAPER.a))  # magnitude of its gain, degC per t/h
+POLE: Final = float(np.abs(np.roots(PAPER.a)).max())  # its pole of the dominant time constant
+# Half the range of its actuator, t/h.
+HALF_RANGE: Final = (PAPER.range_of("u_max")[1] - PAPER.range_of("u_min")[0]) / 2.0
+HARD: Final = PRESETS["hard"]  # arguments of the environment `MiddlePointHard-v0`
+# Shortest and longest time for which a random set point of `hard` keeps a level, samples.
+HOLDS: Final = (100, 300)
+# A hold time that never ends, samples, for set points that do not change at random.
+UNCHANGED: Final = 1e30
+DELAYS: Final = 13  # number of delays in the bank of models of each plant
+# Ranges of the environment's arguments that contain the numbers of all training plants. Every
+# episode sets the plant numbers within these ranges.
 RANGES: Final[dict[str, Any]] = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),
@@ -41,31 +45,40 @@ RANGES: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Batch:
-    """An episode of n plants, and what the controllers know of them."""
+    """An episode of n plants, and what the controllers know of the plants in advance."""
 
     numbers: dict[str, Tensor]
-    """Plant numbers by the environment's arguments, each of shape (n,)."""
+    """The plant numbers by the names of the environment's arguments, each of shape (n,)."""
     setpoints: Tensor
-    """degC, shape (SAMPLES + 1, n), as the following two."""
+    """Set points at k = 0 to SAMPLES, degC, shape (SAMPLES + 1, n)."""
     ages: Tensor
-    """Samples since the set point changed."""
+    """Number of samples since the last change of the set point, shape (SAMPLES + 1, n)."""
     innovations: Tensor
-    """xi of (28), degC."""
+    """The white noise xi of equation (28) of the paper, degC, shape (SAMPLES + 1, n)."""
     changes_by_surprise: Tensor
-    """Whether a set point changes as in `hard`, at random, shape (n,)."""
+    """Whether the set point of a plant changes at random, as in the preset `hard`, shape
+    (n,)."""
     amplitudes: Tensor
-    """Largest set point, degC, shape (n,)."""
+    """Largest possible set point of each plant, degC, shape (n,)."""
     random_setpoint: RandomSetpoint
-    """What the controllers know of the changes of the set points, of the authority."""
+    """The distribution of the set points that controllers know; its amplitudes are shares of
+    the authority."""
     prior: Prior
+    """The prior knowledge of the plants' dynamics, for the bank of models."""
     authorities: np.ndarray[Any, np.dtype[np.float32]]
-    """Steady effect of half the range of flows in the step test, degC, shape (n,)."""
+    """Authority of each plant, degC, shape (n,): the steady change of temperature that half the
+    actuator's range causes in the step test."""
     edges: np.ndarray[Any, np.dtype[np.float32]]
-    """Widest edge of the dead zone, of half the range, shape (n,)."""
+    """Greatest half width that the dead zone may have, as a share of half the actuator's range,
+    shape (n,)."""
 
     @property
     def signals(self) -> dict[str, Tensor]:
-        """Signals and numbers for the environment's `reset`."""
+        """Plant numbers, set points and coloured noise, an option of the environment's reset.
+
+        The noise, degC, is C xi: the white noise after the polynomial C of equation (28) of the
+        paper.
+        """
         noise = self.innovations.clone()
         for lag, coefficient in enumerate(PAPER.c[1:], start=1):
             noise[lag:] += coefficient * self.innovations[:-lag]
@@ -73,7 +86,10 @@ class Batch:
 
 
 def environment(n: int) -> MiddlePointTorchEnv:
-    """Return n differentiable plants that show the set point and the measured output."""
+    """Return a differentiable environment of n plants.
+
+    An observation of a plant is the set point and the measured output, degC.
+    """
     return MiddlePointTorchEnv(
         n,
         differentiable=True,
@@ -86,11 +102,21 @@ def environment(n: int) -> MiddlePointTorchEnv:
 
 
 class Sampler:
-    """Random batches of n plants, a share of which is like those of `hard`.
+    """A generator of random batches of n plants for training.
 
-    Of the others, one half is known by an exact step test and drifts in part, and one half has
-    a step test that is wrong. Their set points are held for longer than the longest hold of
-    `hard`, and mostly alternate.
+    A share of the plants is like the plants of the preset `hard`. Half of the other plants are
+    known by an exact step test, and the other half by a step test with errors. The set points
+    of all plants that are not like `hard` last longer than those of `hard`, and mostly
+    alternate between a positive and a negative value.
+
+    Parameters
+    ----------
+    n
+        Number of plants in a batch.
+    hard_share
+        Share of the plants that are like those of `hard`.
+    seed
+        Seed of all random numbers.
     """
 
     def __init__(self, n: int, hard_share: float, seed: int) -> None:
@@ -100,7 +126,7 @@ class Sampler:
         self._generator.manual_seed(seed)
 
     def batch(self) -> Batch:
-        """Return new plants."""
+        """Return a new random batch of n plants for an episode."""
         kind = self._uniform(0.0, 1.0)
         hard = kind < self._hard_share
         exact = kind > (1.0 + self._hard_share) / 2.0
@@ -135,21 +161,28 @@ class Sampler:
         )
 
     def _uniform(self, low: Any, high: Any, *shape: int) -> Tensor:
-        """Return uniform numbers, with shape (n,) by default."""
+        """Return random numbers that are uniformly distributed from `low` to `high`.
+
+        The shape is `shape`, or (n,) by default; `low` and `high` broadcast against it.
+        """
         uniform = torch.rand(*(shape or (self._n,)), generator=self._generator)
         values: Tensor = low + uniform * (high - low)
         return values
 
     def _normal(self) -> Tensor:
-        """Return normal numbers within two standard deviations, shape (n,)."""
+        """Return standard normal random numbers, limited to [-2, 2], shape (n,)."""
         return torch.randn(self._n, generator=self._generator).clamp(-2.0, 2.0)
 
     def _some(self, share: float) -> Tensor:
-        """Return True for a share of the plants."""
+        """Return bools, shape (n,), each of which is True with the probability `share`."""
         return self._uniform(0.0, 1.0) < share
 
     def _numbers(self, hard: Tensor) -> dict[str, Tensor]:
-        """Return the plants' numbers, of `hard` and wider ones."""
+        """Return random plant numbers by the names of the environment's arguments.
+
+        `hard` says which plants are like those of the preset `hard`, shape (n,). The numbers of
+        the other plants come from wider ranges. Each array of numbers has the shape (n,).
+        """
         noisy, loaded, drifts = self._some(0.65), self._some(0.5), self._some(0.4)
         octave = math.log(2.0)
         others = {
@@ -176,7 +209,12 @@ class Sampler:
         return numbers
 
     def _setpoints(self, amplitudes: Tensor, hard: Tensor) -> tuple[Tensor, Tensor]:
-        """Return set points, degC, and their ages, samples, each of shape (SAMPLES + 1, n)."""
+        """Return random set points, degC, and the number of samples since their last change.
+
+        `amplitudes` are the largest set points, degC, and `hard` says which plants are like
+        those of the preset `hard`, both of shape (n,). Both results have the shape
+        (SAMPLES + 1, n).
+        """
         n, (shortest, longest) = self._n, HOLDS
         low = torch.where(hard, float(shortest), self._uniform(longest + 10.0, 700.0))
         high = torch.where(hard, float(longest), low + longest)
@@ -196,10 +234,26 @@ class Sampler:
     def _knowledge(
         self, numbers: dict[str, Tensor], hard: Tensor, exact: Tensor
     ) -> tuple[Prior, Tensor]:
-        """Return the prior, and the step tests' gains as multiples of the paper's.
+        """Return the prior knowledge of the plants, and the gains of their step tests.
 
-        Every bank has the same shape. Where the step test is exact, one of its models is
-        certain.
+        The bank of every plant has the same number of models. For a plant with an exact step
+        test, the model of the step test has the probability 1.
+
+        Parameters
+        ----------
+        numbers
+            The plant numbers, by the names of the environment's arguments.
+        hard
+            Whether a plant is like those of the preset `hard`, shape (n,).
+        exact
+            Whether the step test of a plant is exact, shape (n,).
+
+        Returns
+        -------
+        prior : Prior
+            Models and probabilities, for the bank of models.
+        gains : Tensor
+            Gains of the step tests, as multiples of the paper's gain, shape (n,).
         """
         middle = sum(HARD["gain_factor"]) / 2.0  # of gain and time constant in `hard`
         wrong = {"gain_factor": GAIN_SPREAD, "time_constant_factor": 0.35}

@@ -1,8 +1,9 @@
 """Train PPO of Stable-Baselines3 on many plants at once, and export its policy to NumPy.
 
-`RECIPES` are those of `ppo`, for the paper's plant, and of `ppo-hard`, for plants that vary.
-What makes them work stands in `benchmarks/examples/sb3.py`, from which they take it. Here are
-plants of several kinds, longer memories and the validation.
+`RECIPES` has a recipe `ppo` for the paper's plant, and a recipe `ppo-hard` for plants that
+differ between episodes. Both recipes use the training of `benchmarks/examples/sb3.py`, where
+the reasons for its success are explained. This module adds training on plants of several kinds,
+observations with a longer past, and the validation of trained policies.
 """
 
 import time
@@ -34,41 +35,50 @@ Array = NDArray[np.float64]
 
 load = PolicyNetwork.load
 
-TRAINING_SEEDS = SEEDS["training"].first  # of the training plants
-MAX_MOVE = 2.0  # change of the flow at an action of 1, as a share of half its range
+TRAINING_SEEDS = SEEDS["training"].first  # least seed of the training plants
+# Change of the flow per sample at an action of 1, as a share of half the actuator's range: with
+# 2.0, the flow can cross the entire range in a sample.
+MAX_MOVE = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """The settings of a training."""
+    """The settings of a training of a policy by PPO."""
 
-    plants: tuple[tuple[int, Mapping[str, Any]], ...]  # how many, and their arguments
-    cases: Mapping[str, Mapping[str, Any]]  # of the validation, which no published result uses
-    # Half width that is compensated between policy and plant, t/h. If it is above 0, a
-    # comparison compensates that of the plant it runs.
+    # Kinds of training plants: the number of plants, and their arguments of the environment.
+    plants: tuple[tuple[int, Mapping[str, Any]], ...]
+    # Arguments of the environment for each case of the validation, by name. No published result
+    # uses these cases.
+    cases: Mapping[str, Mapping[str, Any]]
+    # Half width of the dead zone that is compensated between policy and plant, t/h; 0 for no
+    # compensation. If it is above 0, a comparison sets it to the dead zone of the plant.
     dead_zone: float
-    levels: bool  # whether the policy also sees the set point and the flow
-    hidden: tuple[int, ...]  # nodes of the policy's layers; without any, it is linear
-    memory: int  # past temperatures and past flows in the observation
+    # Whether the policy's inputs include the set point and the flow, in addition to the error
+    # and to changes of set point, temperature and flow.
+    levels: bool
+    hidden: tuple[int, ...]  # nodes of the policy's hidden layers; () for a linear policy
+    memory: int  # number of past temperatures, and of past flows, in the observation
     steps: int  # samples of experience, summed over all plants
-    # Logarithm of the action's standard deviation, at the start and at the end.
+    # Natural logarithm of the standard deviation of the action, at the start and at the end of
+    # the training.
     log_std: tuple[float, float] = (-1.2, -3.5)
 
     @property
     def windows(self) -> dict[str, Any]:
-        """Arguments of the environment that give the policy its observation."""
+        """The arguments of the environment that determine the policy's observation."""
         past = {"output_window": self.memory, "action_window": self.memory}
         return {"setpoint_window": 3, "error_window": 1, **past}
 
     @property
     def temperature_scale(self) -> float:
-        """Size of the set points, as a multiple of that on the paper's plant."""
+        """The amplitude of the set points, as a multiple of the paper's amplitude."""
         _, arguments = self.plants[0]
         scale: float = arguments.get("error_scale", _ERROR_SCALE) / _ERROR_SCALE
         return scale
 
 
-# degC; brings returns to a size of about 1, which are learnt quickly.
+# The error, degC, at which the reward is -1. With this scale, returns are of order 1, so that
+# the value function is learnt quickly.
 _ERROR_SCALE = 50.0
 _COST = {"reward": "absolute", "error_scale": _ERROR_SCALE}
 _RANDOM = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
@@ -98,10 +108,16 @@ RECIPES = {
 
 
 def for_plant(plant: Mapping[str, Any]) -> Recipe:
-    """Return the recipe of `ppo` for another plant, by arguments of the environment.
+    """Return the recipe `ppo` for another plant than the paper's.
 
-    Set points, errors and temperatures scale with `setpoint_amplitude`. A plant without noise
-    has some in most of the training, in proportion to what the flow reaches.
+    Set points, errors and temperatures are scaled in proportion to `setpoint_amplitude`. If the
+    plant has no noise, most training plants get noise in proportion to the largest temperature
+    that the flow can cause.
+
+    Parameters
+    ----------
+    plant
+        Arguments of the environment for the plant.
     """
     parameters, paper = Parameters(**plant), Parameters()
     amplitude = parameters.setpoint_amplitude / paper.setpoint_amplitude
@@ -132,9 +148,19 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
 
 
 def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> PolicyNetwork:
-    """Train a policy, and return it with the results of its validation.
+    """Train a policy, and return the policy with the results of its validation.
 
-    `plant` holds the arguments of the plant that a recipe `for_plant` is for.
+    The validation is part of the policy's `provenance`.
+
+    Parameters
+    ----------
+    recipe
+        The settings of the training.
+    seed
+        Seed of the initial weights, the exploration and the plants.
+    plant
+        Arguments of the environment for the plant that the recipe was made for by `for_plant`;
+        None for one of `RECIPES`.
     """
     began, model = time.process_time(), begin(recipe, seed)
     model.learn(recipe.steps, callback=Exploration(*recipe.log_std))
@@ -162,16 +188,26 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
 
 
 def begin(recipe: Recipe, seed: int) -> PPO:
-    """Return an untrained model."""
+    """Return an untrained model of Stable-Baselines3 for a recipe.
+
+    `seed` is the seed of the initial weights, the exploration and the plants.
+    """
     torch.set_num_threads(1)  # the networks are too small for more
     layers = {"pi": list(recipe.hidden), "vf": [64, 64]}
     return make_ppo(Plants(recipe), seed, net_arch=layers)
 
 
 class Plants(GymnasiumVecEnv):
-    """The training plants, in groups that draw the same numbers from one seed.
+    """The training plants of a recipe, as a vector environment of Stable-Baselines3.
 
-    Their observations are the inputs of the networks, which are much shorter.
+    The plants of a group have the same seed, and so the same plant numbers, noise and set
+    points. An observation holds the inputs of the policy, which `features` computes from the
+    environment's longer observation.
+
+    Parameters
+    ----------
+    recipe
+        The settings of the training, which name the plants and the observation.
     """
 
     def __init__(self, recipe: Recipe) -> None:
@@ -186,16 +222,23 @@ class Plants(GymnasiumVecEnv):
         self.observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seeds of the next reset, to numbers that no comparison uses."""
+        """Set and return the seeds of the plants for the next reset.
+
+        The seeds follow from `seed`, and no comparison of controllers uses them.
+        """
         (first,) = np.random.SeedSequence(seed).generate_state(1).tolist()
         return super().seed(TRAINING_SEEDS + first)
 
     def reset(self) -> NDArray[Any]:
-        """Reset all plants."""
+        """Reset all plants, and return their observations, shape (plants, inputs)."""
         return super().reset() @ self._features
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all plants."""
+        """Step all plants by the actions of `step_async`; return what `VecEnv` asks for.
+
+        Observations, and the last observations of ended episodes in the infos, are converted to
+        the policy's inputs.
+        """
         observations, rewards, ended, infos = super().step_wait()
         for i in np.flatnonzero(ended).tolist():
             infos[i]["terminal_observation"] = infos[i]["terminal_observation"] @ self._features
@@ -203,7 +246,11 @@ class Plants(GymnasiumVecEnv):
 
 
 def features(recipe: Recipe) -> Array:
-    """Return the matrix of an observation's inputs of the networks, (inputs, its size)."""
+    """Return the matrix that converts an observation to the inputs of the policy.
+
+    The shape is (inputs, size of the observation). The inputs are the error and the changes of
+    set point, temperature and flow and, with `recipe.levels`, the set point and the flow.
+    """
     one = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
     one[: -recipe.memory] /= recipe.temperature_scale  # all but the flows are temperatures
     seen = inputs(one, recipe.windows)
@@ -213,7 +260,11 @@ def features(recipe: Recipe) -> Array:
 
 
 def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
-    """Return the mean of a model's policy as a network in NumPy."""
+    """Return a trained policy, without exploration, as a network in NumPy.
+
+    The conversion of observations to inputs becomes part of the first layer. `model` was
+    trained with `recipe`.
+    """
     layers = [
         (layer.weight.detach().double().numpy(), layer.bias.double().numpy())
         for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net)
