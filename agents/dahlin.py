@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 class DahlinController(InternalModelController):
     """A controller that makes the output approach the set point like a first-order lag.
 
-    The controller is that of E. B. Dahlin, "Designing and tuning digital controllers",
+    The controller was published by E. B. Dahlin, "Designing and tuning digital controllers",
     Instruments and Control Systems 41 (6), 1968, 77-83, written as internal model control (M.
     Morari and E. Zafiriou, "Robust Process Control", 1989, chapter 3). Let h be the sampling
     interval, g = 1 - exp(-h / lambda) and f = 1 - exp(-h / T_f):

@@ -281,16 +281,23 @@ class Law:
         gains = gain * convert(estimate.shares)
         rate = 1.0 - convert(estimate.pole)
         target = convert(situation.targets)
-        model = (gains * self._response).sum(0)
+        model_output = (gains * self._response).sum(0)
         share: Any = SHARE
         if network is not None:
-            slope = model - (gains * self._before).sum(0)
-            outputs = network(self._inputs(situation, model, slope))
-            excess = convert(situation.noise - LEAST_NOISE - DOUBT)
+            slope = model_output - (gains * self._before).sum(0)
+            outputs = network(self._inputs(situation, model_output, slope))
+            shift = outputs[:, 0]
+            stretch = outputs[:, 1]
+            speed = outputs[:, 2]
+            # Without noise, the shift is 0, so that it leaves no offset.
+            noise = convert(situation.noise - LEAST_NOISE - DOUBT)
             spread = convert(situation.gain_spread)
-            target = target * (1.0 + spread * outputs[:, 1]) + excess * outputs[:, 0]
-            share = 1.0 / (1.0 + self._exp(-2.0 * outputs[:, 2]))
-        return self._passing((target + share / rate * (target - model)) / gain)
+            target = target * (1.0 + spread * stretch) + noise * shift
+            share = 1.0 / (1.0 + self._exp(-2.0 * speed))
+        # The flow for `target` holds the output there, and that for `approach` closes a share of
+        # the gap in one sample.
+        approach = share / rate * (target - model_output)
+        return self._passing((target + approach) / gain)
 
     def _inputs(self, situation: Situation, model: Any, slope: Any) -> Any:
         """Return all inputs of a network, shape (n, INPUTS), of order 1.

@@ -265,7 +265,7 @@ class External:
 
 
 def read_signals(signals: Any, parameters: Parameters, zeros: Tensor) -> dict[str, External]:
-    """Return the signals and plant numbers in `options["signals"]` of a reset, by name.
+    """Return the signals and parameters of the plants in `options["signals"]` of a reset.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ def _refuse_pipe(_: Any) -> NoReturn:
 
 
 def _why_not(layer: Any) -> str:
-    """Return why a layer must not be copied; "" if a copy may be tried."""
+    """Return why an environment or wrapper must not be copied; "" if a copy may be tried."""
     name = type(layer).__name__
     if runs_processes(layer):
         return f"{name} runs in other processes"
