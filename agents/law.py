@@ -294,8 +294,8 @@ class Law:
             spread = convert(situation.gain_spread)
             target = target * (1.0 + spread * stretch) + noise * shift
             share = 1.0 / (1.0 + self._exp(-2.0 * speed))
-        # The flow for `target` holds the output there, and that for `approach` closes a share of
-        # the gap in one sample.
+        # The flow for `target` holds the output there, and the flow for `approach` closes a
+        # share of the gap in one sample.
         approach = share / rate * (target - model_output)
         return self._passing((target + approach) / gain)
 

@@ -190,9 +190,9 @@ class SetPointLaw:
     def _lean(self, added: Array) -> Array:
         """Return the guess g at ages when the output has followed, by age, shape (samples,).
 
-            The guess is such that an additional flow at any of these ages changes the expected
-            error by nothing: the sum over later ages of the impulse response times the mean of g is
-            0. The equations are solved from the highest age of a set point, the number of samples
+        The guess is such that an additional flow at any of these ages changes the expected
+        error by nothing: the sum over later ages of the impulse response times the mean of g is
+        0. The equations are solved from the highest age of a set point, the number of samples
         since it changed, down to the lowest. `added` is defined as in `_expected`.
         """
         samples = len(self._still_held)
