@@ -211,7 +211,7 @@ def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
     if (plants["oscillates"] >= OFTEN).any():
         entries["oscillates"] = Line2D([], [], **OSCILLATES)
     if (plants["useless"] >= OFTEN).any():
-        entries["no better than an idle valve"] = Patch(color=USELESS)
+        entries["no better than idle"] = Patch(color=USELESS)
     if plants["ratio"].isna().any():
         entries["least possible error unknown"] = Patch(color=NO_RATIO)
     return entries
