@@ -101,6 +101,7 @@ class SelfTuningController(ModelBasedController):
         self._unit_flow = math.copysign((self.u_max - self.u_min) / 2.0, self.gain)  # t/h
         self._authority = self.gain * self._unit_flow  # degC
         self._delays, self._log_probabilities = self._delay_prior()
+        self._random_setpoint = self._setpoint_distribution()
 
     def _delay_prior(self) -> tuple[NDArray[np.intp], Array]:
         """Return the delays of the bank's models and the logarithms of their probabilities.
@@ -173,7 +174,7 @@ class SelfTuningController(ModelBasedController):
         low, high = sorted([self.u_min / self._unit_flow, self.u_max / self._unit_flow])
         limits = np.full(n, low, np.float32), np.full(n, high, np.float32)
         self._bank = Bank(self._prior(n))
-        self._observer = Observer(self._bank, edges, limits, self._random_setpoint())
+        self._observer = Observer(self._bank, edges, limits, self._random_setpoint)
         self._law = Law(self._bank, edges, limits)
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -197,7 +198,7 @@ class SelfTuningController(ModelBasedController):
         command: NDArray[np.float64] = self._held
         return command
 
-    def _random_setpoint(self) -> RandomSetpoint | None:
+    def _setpoint_distribution(self) -> RandomSetpoint | None:
         """Return the distribution of the set point, scaled; None if it is not known.
 
         Times are in intervals at which the controller acts, and the amplitude is a share of the

@@ -323,3 +323,10 @@ class TestScales:
             for _ in range(4):
                 slow.act(rows)
                 np.testing.assert_allclose(slow.command, plain.command, atol=0.01)
+
+
+@pytest.mark.parametrize("name", ["delay_range", "setpoint_holds"])
+@pytest.mark.parametrize("limits", [(5.0,), (9.0, 3.0), (-1.0, 3.0), (0.0, np.nan), "soon"])
+def test_a_range_of_times_that_is_none_is_refused_when_the_controller_is_made(name, limits):
+    with pytest.raises(ValueError, match=f"{name} must be two finite numbers of at least 0"):
+        SelfTuningController(**KNOWN, **{name: limits})
