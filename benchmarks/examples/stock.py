@@ -67,7 +67,7 @@ class Curve(BaseCallback):
         if spent < self._seconds * (self._scores + 1) / SCORES:
             return True
         self._score(spent)
-        self._began += time.process_time() - self._began - spent
+        self._began = time.process_time() - spent  # as a score is no part of the training
         return self._scores < SCORES
 
     def _score(self, spent: float) -> None:
