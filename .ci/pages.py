@@ -13,7 +13,7 @@ from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 
 from mptc_gym import evaluation
-from mptc_gym.parameters import argument_table
+from mptc_gym.plant.parameters import argument_table
 
 ROOT = Path(__file__).parent.parent
 CONTRIBUTING = ".github/CONTRIBUTING.md"

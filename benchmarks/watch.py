@@ -12,7 +12,7 @@ from benchmarks.lib.storage import file_name, out_folder
 from benchmarks.loop.rollout import Trajectory, drawn_numbers, mean_error
 from benchmarks.loop.scenarios import SCENARIOS, PlantOptions
 from mptc_gym import Parameters
-from mptc_gym.parameters import PlantNumbers
+from mptc_gym.plant.parameters import PlantNumbers
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -111,8 +111,8 @@ def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterat
     """
     from PIL import Image
 
-    from mptc_gym.drawing import frame  # imported here, as it needs pygame
-    from mptc_gym.record import Record
+    from mptc_gym.environments.drawing import frame  # imported here, as it needs pygame
+    from mptc_gym.environments.record import Record
 
     drawn = drawn_numbers(parameters, 1, seed)
     numbers = {name: float(values[0]) for name, values in vars(drawn).items()}

@@ -13,7 +13,7 @@ import gymnasium
 
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.evaluation import Evaluation, evaluate
-from mptc_gym.parameters import Parameters
+from mptc_gym.plant.parameters import Parameters
 from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 

@@ -15,12 +15,12 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
-from mptc_gym.checks import one_action, one_of, plain
-from mptc_gym.draws import Ranges, Streams, plant_numbers
-from mptc_gym.parameters import Parameters, insert_table, spelt_out
-from mptc_gym.plant import Plant, action_from_command
-from mptc_gym.record import Record
-from mptc_gym.signals import ONE, Signals
+from mptc_gym.environments.record import Record
+from mptc_gym.plant.checks import one_action, one_of, plain
+from mptc_gym.plant.draws import Ranges, Streams, plant_numbers
+from mptc_gym.plant.dynamics import Plant, action_from_command
+from mptc_gym.plant.parameters import Parameters, insert_table, spelt_out
+from mptc_gym.plant.signals import ONE, Signals
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys of every info
 _FLOAT32 = np.dtype(np.float32)  # np.fromiter takes a dtype faster than the type np.float32
@@ -427,7 +427,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             return None
         if self._record is None:
             raise ResetNeeded("call reset before render")
-        from mptc_gym import drawing  # which needs pygame
+        from mptc_gym.environments import drawing  # which needs pygame
 
         if self.render_mode == "rgb_array":
             return drawing.frame(self._record)
@@ -437,7 +437,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     def close(self) -> None:
         """Close the window, unless another environment still shows pictures in the window."""
         if self.render_mode == "human" and self._record is not None:
-            from mptc_gym import drawing  # which needs pygame
+            from mptc_gym.environments import drawing  # which needs pygame
 
             drawing.hide(self)
         self._record = None

@@ -12,10 +12,10 @@ from typing import Any, Final, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.checks import MOST_PLANTS, count
-from mptc_gym.layers import plant_groups
-from mptc_gym.parameters import ARGUMENTS, Parameters
-from mptc_gym.plant import action_from_command
+from mptc_gym.environments.layers import plant_groups
+from mptc_gym.plant.checks import MOST_PLANTS, count
+from mptc_gym.plant.dynamics import action_from_command
+from mptc_gym.plant.parameters import ARGUMENTS, Parameters
 from mptc_gym.presets import IDS
 from mptc_gym.scoring.fit import check_fit
 from mptc_gym.scoring.opening import Plants, opened

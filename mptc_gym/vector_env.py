@@ -13,14 +13,14 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.checks import is_count, many_actions, one_of, plain, reject
-from mptc_gym.draws import Ranges, Streams, plant_numbers
 from mptc_gym.env import NO_MODE, Frame, MiddlePointEnv
-from mptc_gym.parameters import spelt_out
-from mptc_gym.plant import PlantBatch, action_from_command
-from mptc_gym.record import Record
-from mptc_gym.signals import BLOCK, Indices, Signals, Values
+from mptc_gym.environments.batch import BatchEnv, Infos, Mask
+from mptc_gym.environments.record import Record
+from mptc_gym.plant.checks import is_count, many_actions, one_of, plain, reject
+from mptc_gym.plant.draws import Ranges, Streams, plant_numbers
+from mptc_gym.plant.dynamics import PlantBatch, action_from_command
+from mptc_gym.plant.parameters import spelt_out
+from mptc_gym.plant.signals import BLOCK, Indices, Signals, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 
@@ -145,7 +145,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             return None
         if not self._records:
             raise ResetNeeded("call reset before render")
-        from mptc_gym import drawing  # which needs pygame
+        from mptc_gym.environments import drawing  # which needs pygame
 
         return tuple(map(drawing.frame, self._records.values()))
 

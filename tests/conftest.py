@@ -18,9 +18,10 @@ from hypothesis import settings
 from hypothesis import strategies as st
 
 from benchmarks.loop.rollout import Trajectory
-from mptc_gym import MiddlePointVectorEnv, checks
+from mptc_gym import MiddlePointVectorEnv
 from mptc_gym.evaluation import WINDOWS
-from mptc_gym.parameters import ARGUMENTS, PLANT_NUMBERS
+from mptc_gym.plant import checks
+from mptc_gym.plant.parameters import ARGUMENTS, PLANT_NUMBERS
 
 ROOT = Path(__file__).parent.parent
 if not os.access(ROOT, os.W_OK):

@@ -22,7 +22,7 @@ from benchmarks.loop.rollout import held, make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
 from mptc_gym import Parameters
 from mptc_gym.evaluation import SEED
-from mptc_gym.plant import action_from_command
+from mptc_gym.plant.dynamics import action_from_command
 
 EARLY = 270  # age of a level, samples, from which `Early` expects the next one
 

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv, Parameters
 from mptc_gym.env import INFO
-from mptc_gym.plant import FACTORS
+from mptc_gym.plant.dynamics import FACTORS
 from tests.conftest import MODES, NOISY, assert_the_seed_is_all_that_differs
 
 

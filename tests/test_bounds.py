@@ -21,8 +21,8 @@ from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
 from mptc_gym import PRESETS, Parameters
-from mptc_gym.draws import Ranges
-from mptc_gym.plant import action_from_command
+from mptc_gym.plant.draws import Ranges
+from mptc_gym.plant.dynamics import action_from_command
 from tests.verify_bounds import CONTROLLERS, beats, errors
 
 CALM = Parameters()

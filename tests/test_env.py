@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv, Parameters
 from mptc_gym.evaluation import WINDOWS
-from mptc_gym.parameters import PLANT_NUMBERS, argument_table
+from mptc_gym.plant.parameters import PLANT_NUMBERS, argument_table
 from tests.conftest import ROOT, run, valid_arguments
 
 INFO = {"output", "setpoint", "error", "command", "applied", "noise"}

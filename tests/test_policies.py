@@ -31,8 +31,8 @@ from stable_baselines3.common.vec_env import VecFrameStack as Stack
 
 from agents import DirectNNController, PIController
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, evaluate
+from mptc_gym.environments.layers import layers
 from mptc_gym.evaluation import SEED
-from mptc_gym.layers import layers
 from mptc_gym.sb3 import load, make_vec_env, save, spec_of
 from mptc_gym.torch_env import MiddlePointTorchEnv
 from mptc_gym.wrappers import IncrementalAction

@@ -15,11 +15,11 @@ from gymnasium.utils.env_checker import data_equivalence
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import mptc_gym
-from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, drawing
-from mptc_gym.draws import Ranges
-from mptc_gym.parameters import Parameters
-from mptc_gym.record import Record
+from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, environments
+from mptc_gym.environments import drawing
+from mptc_gym.environments.record import Record
+from mptc_gym.plant.draws import Ranges
+from mptc_gym.plant.parameters import Parameters
 from tests.conftest import MODES, NOISY, native_and_sync
 
 SHAPE = (540, 960, 3)
@@ -183,8 +183,8 @@ def test_what_cannot_be_drawn_is_said(made, monkeypatch):
     with pytest.warns(UserWarning, match="render mode"):
         assert env.render() is None
     monkeypatch.setitem(sys.modules, "pygame", None)  # not installed
-    monkeypatch.delitem(sys.modules, "mptc_gym.drawing")
-    monkeypatch.delattr(mptc_gym, "drawing")
+    monkeypatch.delitem(sys.modules, "mptc_gym.environments.drawing")
+    monkeypatch.delattr(environments, "drawing")
     for draw in (drawn.render, MiddlePointEnv(render_mode="human").reset):
         with pytest.raises(DependencyNotInstalled, match=r'pip install "mptc_gym\[render\]"'):
             draw()

@@ -23,6 +23,7 @@ from mptc_gym import MiddlePointEnv, evaluate
 from mptc_gym import sb3 as ours
 from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.sb3 import ScoreCallback, load, make_vec_env, save, spec_of
+from mptc_gym.sb3.models import MEMBER
 from mptc_gym.wrappers import IncrementalAction
 
 HARD = "MiddlePointHard-v0"
@@ -179,7 +180,7 @@ class TestZips:
         model, file = model_of(make_vec_env(wrapper=VELOCITY)), tmp_path / "model.zip"
         save(model, file)
         with zipfile.ZipFile(file) as archive:
-            record = archive.read(ours.MEMBER).decode()
+            record = archive.read(MEMBER).decode()
         for edited, message in (
             ("{}", "KeyError"),
             (record.replace("PPO", "PPOO"), "AttributeError"),
@@ -189,7 +190,7 @@ class TestZips:
             model.save(file)
             if edited:
                 with zipfile.ZipFile(file, "a") as archive:
-                    archive.writestr(ours.MEMBER, edited)
+                    archive.writestr(MEMBER, edited)
             with pytest.raises(ValueError, match=message):
                 load(file)
         save(model, file)

@@ -18,9 +18,9 @@ from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv  # noqa: E402
-from mptc_gym.draws import Ranges, Streams  # noqa: E402
-from mptc_gym.plant import action_from_command, float32_action  # noqa: E402
-from mptc_gym.signals import Signals  # noqa: E402
+from mptc_gym.plant.draws import Ranges, Streams  # noqa: E402
+from mptc_gym.plant.dynamics import action_from_command, float32_action  # noqa: E402
+from mptc_gym.plant.signals import Signals  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv, make_vec  # noqa: E402
 from mptc_gym.wrappers import IncrementalAction  # noqa: E402
 from tests.conftest import MODES, random_actions, valid_arguments  # noqa: E402

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from benchmarks.bounds.linear_program import Unknown, equations, response
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import held
-from mptc_gym.signals import Levels
+from mptc_gym.plant.signals import Levels
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from benchmarks.bounds.unknown import (
     unknown_of_normal,
 )
 from benchmarks.loop.linear import LinearModel
-from mptc_gym.signals import LOAD_INTERVAL
+from mptc_gym.plant.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 

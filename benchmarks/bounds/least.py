@@ -31,9 +31,9 @@ from benchmarks.loop.rollout import (
     rollout,
 )
 from mptc_gym import Parameters
-from mptc_gym.draws import plant_numbers
 from mptc_gym.evaluation import EPISODES, SEED
-from mptc_gym.parameters import PlantNumbers
+from mptc_gym.plant.draws import plant_numbers
+from mptc_gym.plant.parameters import PlantNumbers
 
 Array = NDArray[np.float64]
 

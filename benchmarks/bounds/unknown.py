@@ -53,7 +53,7 @@ from numpy.typing import NDArray
 
 from benchmarks.bounds.linear_program import Unknown, equations
 from benchmarks.loop.linear import LinearModel
-from mptc_gym.signals import LOAD_INTERVAL
+from mptc_gym.plant.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from agents.hedge import RandomSetpoint
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
-from mptc_gym.plant import DRIFT_INTERVAL
-from mptc_gym.signals import LOAD_INTERVAL, Levels
+from mptc_gym.plant.dynamics import DRIFT_INTERVAL
+from mptc_gym.plant.signals import LOAD_INTERVAL, Levels
 
 Array = NDArray[np.float64]
 

@@ -24,8 +24,8 @@ from benchmarks.controllers.spec import EVERYTHING, LIMITS, ControllerSpec
 from benchmarks.lib.command import FanOut, Names, Parameter, blame, known, options
 from benchmarks.lib.errors import UsageError
 from mptc_gym import IDS, Parameters
+from mptc_gym.environments.layers import plant_groups
 from mptc_gym.evaluation import case_of
-from mptc_gym.layers import plant_groups
 from mptc_gym.scoring.fit import check_fit
 from mptc_gym.scoring.opening import opened
 from mptc_gym.scoring.policies import start

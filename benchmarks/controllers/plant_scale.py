@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
-from mptc_gym.parameters import slowest_pole
+from mptc_gym.plant.parameters import slowest_pole
 
 # Two plants count as different if one of the four magnitudes differs by more than this factor.
 MUCH = 2.0

@@ -11,7 +11,7 @@ from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.linear import LinearLoop, nominal, step_test, time_constant_for
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from mptc_gym import Parameters
-from mptc_gym.signals import Levels
+from mptc_gym.plant.signals import Levels
 
 LEARNING = 1200  # samples of the square wave in which a controller learns before it is measured
 COMMISSIONING_SEED = SEEDS["preparation"].first  # of the plants and noise of this learning

@@ -22,8 +22,8 @@ from numpy.polynomial.polynomial import polyadd, polyval
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters
-from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
-from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
+from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics
+from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
-from mptc_gym.draws import Ranges
-from mptc_gym.parameters import PLANT_NUMBERS, PlantNumbers
-from mptc_gym.plant import action_from_command, least_effective
+from mptc_gym.plant.draws import Ranges
+from mptc_gym.plant.dynamics import action_from_command, least_effective
+from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.scoring.rollout import rollout as run_batch
 
 Array = NDArray[np.float64]

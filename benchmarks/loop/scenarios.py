@@ -16,7 +16,7 @@ from benchmarks.lib.command import Parameter, options
 from benchmarks.lib.errors import UsageError
 from benchmarks.loop.linear import nominal
 from mptc_gym import PRESETS, Parameters
-from mptc_gym.parameters import slowest_pole
+from mptc_gym.plant.parameters import slowest_pole
 
 Arguments = dict[str, Any]  # keyword arguments of the environment `MiddlePoint-v0`
 

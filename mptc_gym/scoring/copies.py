@@ -17,7 +17,14 @@ from typing import Any, Final, NoReturn
 
 from gymnasium.vector import VectorEnv
 
-from mptc_gym.layers import INNER, VEC_ENV, inner_environments, layers, loaded, runs_processes
+from mptc_gym.environments.layers import (
+    INNER,
+    VEC_ENV,
+    inner_environments,
+    layers,
+    loaded,
+    runs_processes,
+)
 
 # The classes of layers that record episodes and change neither observations nor actions: a copy
 # of an environment is made without these layers.

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from gymnasium.spaces import Box
 
-from mptc_gym.layers import (
+from mptc_gym.environments.layers import (
     ask_processes,
     is_environment,
     layers,

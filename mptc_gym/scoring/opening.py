@@ -16,9 +16,15 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.checks import reject
-from mptc_gym.layers import is_environment, layers, loaded, normaliser_flag, plant_groups
-from mptc_gym.making import Env, make_batch, make_one
+from mptc_gym.environments.layers import (
+    is_environment,
+    layers,
+    loaded,
+    normaliser_flag,
+    plant_groups,
+)
+from mptc_gym.environments.making import Env, make_batch, make_one
+from mptc_gym.plant.checks import reject
 from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.policies import form_of
 from mptc_gym.scoring.rollout import in_columns

@@ -16,8 +16,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mptc_gym.checks import reject
-from mptc_gym.layers import is_environment, loaded
+from mptc_gym.environments.layers import is_environment, loaded
+from mptc_gym.plant.checks import reject
 
 # A function of observations, one row for each plant, that returns actions, one row for each
 # plant.

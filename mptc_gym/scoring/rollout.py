@@ -9,9 +9,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.checks import reject, shorten
-from mptc_gym.parameters import Parameters
-from mptc_gym.plant import action_from_command
+from mptc_gym.plant.checks import reject, shorten
+from mptc_gym.plant.dynamics import action_from_command
+from mptc_gym.plant.parameters import Parameters
 from mptc_gym.scoring.policies import Act
 from mptc_gym.vector_env import MiddlePointVectorEnv
 

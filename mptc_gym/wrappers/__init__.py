@@ -15,9 +15,9 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.checks import is_number, one_action, reject
-from mptc_gym.parameters import Parameters
-from mptc_gym.plant import action_from_command, float32_action
+from mptc_gym.plant.checks import is_number, one_action, reject
+from mptc_gym.plant.dynamics import action_from_command, float32_action
+from mptc_gym.plant.parameters import Parameters
 
 NUMBERS = "dead_zone", "u_min", "u_max"  # the arguments that describe the actuator, t/h
 

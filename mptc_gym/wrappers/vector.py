@@ -11,8 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorActionWrapper, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.checks import many_actions, reject
-from mptc_gym.layers import plant_groups
+from mptc_gym.environments.layers import plant_groups
+from mptc_gym.plant.checks import many_actions, reject
 from mptc_gym.wrappers import NUMBERS, Actuator
 
 

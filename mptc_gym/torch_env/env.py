@@ -22,14 +22,14 @@ except ImportError as error:
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.checks import is_count, one_of, reject
 from mptc_gym.env import MiddlePointEnv
-from mptc_gym.making import make_one
-from mptc_gym.parameters import ARGUMENTS, spelt_out
-from mptc_gym.plant import FACTORS, action_from_command
-from mptc_gym.signals import FOREVER, Levels
-from mptc_gym.torch_episodes import (
+from mptc_gym.environments.batch import BatchEnv, Infos, Mask
+from mptc_gym.environments.making import make_one
+from mptc_gym.plant.checks import is_count, one_of, reject
+from mptc_gym.plant.dynamics import FACTORS, action_from_command
+from mptc_gym.plant.parameters import ARGUMENTS, spelt_out
+from mptc_gym.plant.signals import FOREVER, Levels
+from mptc_gym.torch_env.episodes import (
     LONGEST,
     SIGNALS,
     Episodes,
@@ -38,8 +38,8 @@ from mptc_gym.torch_episodes import (
     as_tensor,
     read_signals,
 )
-from mptc_gym.torch_plant import TorchPlants
-from mptc_gym.torch_signals import make_signals
+from mptc_gym.torch_env.plant import TorchPlants
+from mptc_gym.torch_env.signals import make_signals
 
 # Most numbers in a block of a signal on a CPU: 512 KiB of float32, which fit in the cache.
 _IN_CACHE = 1 << 17

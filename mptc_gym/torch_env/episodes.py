@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mptc_gym.checks import reject
-from mptc_gym.parameters import Parameters
-from mptc_gym.plant import DRIFT_INTERVAL
+from mptc_gym.plant.checks import reject
+from mptc_gym.plant.dynamics import DRIFT_INTERVAL
+from mptc_gym.plant.parameters import Parameters
 
 LONGEST = 64  # most samples in a block, which bounds the memory of a block
 SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")  # signals from outside

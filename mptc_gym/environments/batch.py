@@ -17,12 +17,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.env import INFO, HasPlainSpec, observation_space
-from mptc_gym.parameters import Parameters
-from mptc_gym.plant import FACTORS
-from mptc_gym.plant_state import PlantState, plant_state
-from mptc_gym.signals import FOREVER
+from mptc_gym.plant.checks import MOST_PLANTS, count, is_count, reject
+from mptc_gym.plant.dynamics import FACTORS
+from mptc_gym.plant.parameters import Parameters
+from mptc_gym.plant.signals import FOREVER
+from mptc_gym.plant.state import PlantState, plant_state
 
 Array = Any  # a NumPy array or a PyTorch tensor, depending on the environment
 Infos = dict[str, Any]

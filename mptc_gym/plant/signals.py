@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.draws import EpisodeStream, Streams
-from mptc_gym.parameters import Parameters, PlantNumbers
+from mptc_gym.plant.draws import EpisodeStream, Streams
+from mptc_gym.plant.parameters import Parameters, PlantNumbers
 
 # One element per plant, shape (n,); a plant number that all plants share has the shape ().
 Values = NDArray[np.float64]

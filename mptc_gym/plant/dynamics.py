@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import Parameters, PlantNumbers, slowest_pole
+from mptc_gym.plant.parameters import Parameters, PlantNumbers, slowest_pole
 
 Values = NDArray[np.float64]  # one element per plant, shape (n,)
 # Samples between two changes of drifting dynamics: drifts are slow, and a change takes time.

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mptc_gym.parameters import PLANT_NUMBERS, Parameters, PlantNumbers
+from mptc_gym.plant.parameters import PLANT_NUMBERS, Parameters, PlantNumbers
 
 Values = NDArray[np.float64]  # one element per plant, shape (n,), or shape () for all plants
 

@@ -16,7 +16,7 @@ except ImportError as error:
         'pygame is not installed, run `pip install "mptc_gym[render]"`'
     ) from error
 
-from mptc_gym.record import Record
+from mptc_gym.environments.record import Record
 
 Colour = tuple[int, int, int]  # red, green and blue, 0 to 255
 

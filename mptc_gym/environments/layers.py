@@ -14,7 +14,7 @@ import gymnasium
 from gymnasium.vector import AsyncVectorEnv, VectorEnv
 
 from mptc_gym.env import MiddlePointEnv
-from mptc_gym.parameters import Parameters
+from mptc_gym.plant.parameters import Parameters
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
 VEC_ENV: Final = "stable_baselines3.common.vec_env"

@@ -26,11 +26,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 
-from mptc_gym.checks import MOST_PLANTS, count, reject
+from mptc_gym.environments.layers import is_environment, layers, plant_groups
+from mptc_gym.environments.making import make_batch, make_one
 from mptc_gym.evaluation import VALIDATION_SEED, WINDOWS, Evaluation, evaluate
-from mptc_gym.layers import is_environment, layers, plant_groups
-from mptc_gym.making import make_batch, make_one
-from mptc_gym.sb3_vec_env import GymnasiumVecEnv, make_vec_env
+from mptc_gym.plant.checks import MOST_PLANTS, count, reject
+from mptc_gym.sb3.vec_env import GymnasiumVecEnv, make_vec_env
 from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.fit import check_fit
 from mptc_gym.scoring.opening import opened

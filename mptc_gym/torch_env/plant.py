@@ -2,8 +2,8 @@
 
 The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k), with
 temperature y, applied flow u_a, delay d and white noise xi. The actuator, with dead zone and
-limits, is equation (29). `PlantBatch` in `mptc_gym.plant` moves many plants in NumPy, a sample
-at a time.
+limits, is equation (29). `mptc_gym.plant.dynamics.PlantBatch` moves many plants in NumPy, a
+sample at a time.
 """
 
 from collections import deque
@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mptc_gym.parameters import Parameters, PlantNumbers
-from mptc_gym.plant import DRIFT_INTERVAL, Dynamics, least_effective
-from mptc_gym.torch_episodes import Block, Episodes, History, Number
+from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics, least_effective
+from mptc_gym.plant.parameters import Parameters, PlantNumbers
+from mptc_gym.torch_env.episodes import Block, Episodes, History, Number
 
 
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mptc_gym.parameters import Parameters
-from mptc_gym.signals import LOAD_INTERVAL, Levels, colours
-from mptc_gym.torch_episodes import Block, Episodes, External, History
+from mptc_gym.plant.parameters import Parameters
+from mptc_gym.plant.signals import LOAD_INTERVAL, Levels, colours
+from mptc_gym.torch_env.episodes import Block, Episodes, External, History
 
 
 class Noise:
@@ -167,7 +167,7 @@ class RepeatedSetPoint:
 class Disturbance:
     """The load disturbance w(k), degC, of many plants: the sum of steps and a random walk.
 
-    The distribution of the load is that of `mptc_gym.signals.Disturbance`.
+    The distribution of the load is that of `mptc_gym.plant.signals.Disturbance`.
 
     Parameters
     ----------

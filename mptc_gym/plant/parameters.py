@@ -13,8 +13,8 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from mptc_gym import checks
-from mptc_gym.checks import Number, reject
+from mptc_gym.plant import checks
+from mptc_gym.plant.checks import Number, reject
 
 Value = TypeVar("Value")  # type of a `PlantNumbers` field: float, array, tensor or `Number`
 _LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")

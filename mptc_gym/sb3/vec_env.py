@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from mptc_gym.checks import MOST_PLANTS, count, reject
-from mptc_gym.making import make_batch, make_one
+from mptc_gym.environments.making import make_batch, make_one
+from mptc_gym.plant.checks import MOST_PLANTS, count, reject
 from mptc_gym.wrappers import IncrementalAction
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from mptc_gym.checks import shorten
 from mptc_gym.env import MiddlePointEnv
+from mptc_gym.plant.checks import shorten
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers.vector import IncrementalAction
 

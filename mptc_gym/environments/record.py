@@ -6,7 +6,7 @@ A record holds only numbers, so that an environment can be copied together with 
 from collections import deque
 from typing import NamedTuple
 
-from mptc_gym.parameters import PlantNumbers
+from mptc_gym.plant.parameters import PlantNumbers
 
 SPAN = 200  # fewest samples that a picture spans: some 27 minutes of 8 s samples
 LONGEST = 2000  # most samples that a picture spans, even where four delays are longer

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from mptc_gym.parameters import PLANT_NUMBERS, Parameters, PlantNumbers, slowest_pole
-from mptc_gym.plant import DRIFT_INTERVAL, Dynamics
+from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics
+from mptc_gym.plant.parameters import PLANT_NUMBERS, Parameters, PlantNumbers, slowest_pole
 
 
 class PlantState(NamedTuple):
