@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from mptc_gym.environments.record import Record
 from mptc_gym.plant.checks import one_action, one_of, plain
-from mptc_gym.plant.draws import Ranges, Streams, plant_numbers
 from mptc_gym.plant.dynamics import Plant, action_from_command
 from mptc_gym.plant.parameters import Parameters, insert_table, spelt_out
-from mptc_gym.plant.signals import ONE, Signals
+from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
+from mptc_gym.plant.signals import ONLY_PLANT, Signals
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys of every info
 _FLOAT32 = np.dtype(np.float32)  # np.fromiter takes a dtype faster than the type np.float32
-NO_MODE = (
+NO_RENDER_MODE = (
     "render does nothing without a render mode: make the environment with a render mode, as in "
     'gymnasium.make("MiddlePoint-v0", render_mode="rgb_array")'
 )
@@ -252,10 +252,10 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         places = np.cumsum(parameters.windows).tolist()
         self._layout = parameters.temperature_span, *places
         self._has_more_info = parameters.is_disturbed or parameters.drifts
-        self._ranges = Ranges(parameters)
+        self._plant_sampler = PlantSampler(parameters)
         self._signals = Signals.of(parameters)
         # Random number streams of the only plant; empty before the first reset.
-        self._streams: list[Streams] = []
+        self._streams: list[RandomStreams] = []
         self._root: np.random.Generator | None = None  # whose seed the streams come from
         # Set point y_d, noise n, load w and measurement noise, degC, of the samples to come,
         # the next sample last.
@@ -288,9 +288,9 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         if self._root is not self.np_random:
             self._root = self.np_random
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
-            self._streams = [Streams.spawn(seeds)]
-        numbers_of_plants = self._ranges.draw(self._streams)
-        setpoint = self._signals.reset(ONE, self._streams, numbers_of_plants).item()
+            self._streams = [RandomStreams.spawn(seeds)]
+        numbers_of_plants = self._plant_sampler.sample(self._streams)
+        setpoint = self._signals.reset(ONLY_PLANT, self._streams, numbers_of_plants).item()
         numbers = plant_numbers(numbers_of_plants, 0)
         self._plant = Plant(self.parameters, numbers)
         self._ahead.clear()
@@ -423,7 +423,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             If pygame is not installed.
         """
         if self.render_mode is None:
-            logger.warn(NO_MODE)
+            logger.warn(NO_RENDER_MODE)
             return None
         if self._record is None:
             raise ResetNeeded("call reset before render")

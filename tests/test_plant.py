@@ -8,9 +8,9 @@ from scipy.signal import lfilter
 
 import mptc_gym
 from agents import actuator
-from mptc_gym.plant.draws import EpisodeStream
 from mptc_gym.plant.dynamics import Plant, action_from_command, float32_action
 from mptc_gym.plant.parameters import PlantNumbers
+from mptc_gym.plant.sampling import EpisodeStream
 from tests.conftest import run
 
 A = [1, -0.45181, -0.47546]

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
-from mptc_gym.plant.draws import Ranges
 from mptc_gym.plant.dynamics import action_from_command, least_effective
 from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
+from mptc_gym.plant.sampling import PlantSampler
 from mptc_gym.scoring.rollout import rollout as run_batch
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
     seed
         Seed of the first run: the seed of run i is `seed + i`.
     """
-    numbers = Ranges(parameters).lowest.chosen(PLANT_NUMBERS)
+    numbers = PlantSampler(parameters).lowest.chosen(PLANT_NUMBERS)
     if parameters.ranges:
         _, info = make_plants(runs, 1, **asdict(parameters)).reset(seed=seed)
         for name in parameters.ranges:

@@ -21,7 +21,7 @@ from mptc_gym.env import INFO, HasPlainSpec, observation_space
 from mptc_gym.plant.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.plant.dynamics import FACTORS
 from mptc_gym.plant.parameters import Parameters
-from mptc_gym.plant.signals import FOREVER
+from mptc_gym.plant.signals import UNLIMITED
 from mptc_gym.plant.state import PlantState, plant_state
 
 Array = Any  # a NumPy array or a PyTorch tensor, depending on the environment
@@ -74,7 +74,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         if not is_count(limit, -1) or limit == 0:
             allowed = "an integer of at least 1, or None or -1 for no limit"
             reject("max_episode_steps", max_episode_steps, allowed)
-        self._limit = FOREVER if limit == -1 else min(FOREVER, int(limit))  # samples
+        self._limit = UNLIMITED if limit == -1 else min(UNLIMITED, int(limit))  # samples
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
