@@ -316,7 +316,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         if self.parameters.is_disturbed:
             info["disturbance"] = 0.0
         info |= self._plant.factors
-        info |= numbers.chosen(self.parameters.ranges)
+        info |= numbers.select(self.parameters.ranges)
         return np.fromiter(self._window, _FLOAT32, size), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:

@@ -240,7 +240,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
         infos: dict[str, NDArray[Any]] = {**self._plants.factors}
         infos_of_which = {"setpoint": setpoint, "error": setpoint}
-        infos_of_which |= numbers.chosen(self.parameters.ranges)
+        infos_of_which |= numbers.select(self.parameters.ranges)
         for name, values in infos_of_which.items():
             infos[name] = np.zeros(self.num_envs, values.dtype)
             infos[name][which] = values
@@ -266,7 +266,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         load = self._zeros
         if self._signals.disturbance is not None:
             load = self._signals.disturbance.present
-        return self._plants.numbers.chosen(self.parameters.ranges), load
+        return self._plants.numbers.select(self.parameters.ranges), load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Start new random number streams for plants in `mask` that get a seed from `reset`.

@@ -43,7 +43,7 @@ def met(envs, seed, *, episodes, samples):
             if signal is not None:
                 rows = [signal.next().copy() for _ in range(samples)]
                 found[name].append([first.get(name, np.zeros(n)), *rows])
-        for name, values in numbers.chosen(parameters.ranges).items():
+        for name, values in numbers.select(parameters.ranges).items():
             found[name].append(values)
     return {name: torch.tensor(np.array(values)) for name, values in found.items()}
 

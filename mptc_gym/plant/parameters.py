@@ -96,7 +96,7 @@ class PlantNumbers(Generic[Value]):
         "time constant after `drift_samples` divided by the initial one",
     )
 
-    def chosen(self, names: Iterable[str]) -> dict[str, Value]:
+    def select(self, names: Iterable[str]) -> dict[str, Value]:
         """Return the values of the fields with the names `names`, as a dict by name."""
         return {name: getattr(self, name) for name in names}
 
@@ -211,7 +211,7 @@ class Parameters(PlantNumbers[Number]):
             self._check_time_constant()
         is_stable = abs(slowest_pole(self.a)) < 1.0
         if self.is_disturbed and not is_stable:
-            load_values = tuple(self.chosen(_LOAD_ARGUMENTS).values())
+            load_values = tuple(self.select(_LOAD_ARGUMENTS).values())
             allowed = "0 for this a: the plant is not stable, so it has no steady state"
             reject(", ".join(_LOAD_ARGUMENTS), load_values, allowed)
         if not any(self.windows):
@@ -283,7 +283,7 @@ class Parameters(PlantNumbers[Number]):
         elif lowest_factor * min(lowest_drift, 1.0) < rate:
             allowed = f"such that the factor is never below {rate:g}, where the pole is 0"
         if allowed:
-            reject(", ".join(names), tuple(self.chosen(names).values()), allowed)
+            reject(", ".join(names), tuple(self.select(names).values()), allowed)
 
     def range_of(self, name: str) -> tuple[float, float]:
         """Return the lowest and the highest value of the field `name` of `PlantNumbers`.
@@ -299,7 +299,7 @@ class Parameters(PlantNumbers[Number]):
     @cached_property
     def ranges(self) -> dict[str, tuple[float, float]]:
         """The ends (low, high) of each field of `PlantNumbers` that is a range, by name."""
-        numbers = self.chosen(PLANT_NUMBERS)
+        numbers = self.select(PLANT_NUMBERS)
         return {name: value for name, value in numbers.items() if isinstance(value, tuple)}
 
     @cached_property
