@@ -16,9 +16,9 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym.environments.record import Record
-from mptc_gym.plant.checks import one_action, one_of, plain
+from mptc_gym.plant.checks import one_action, one_of, to_python
 from mptc_gym.plant.dynamics import Plant, action_from_command
-from mptc_gym.plant.parameters import Parameters, insert_table, spelt_out
+from mptc_gym.plant.parameters import Parameters, full_signature, insert_table
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import ONLY_PLANT, Signals
 
@@ -70,7 +70,7 @@ class HasPlainSpec:
         """Store a copy of an `EnvSpec`, with lists and Python numbers for NumPy's types."""
         if spec is not None:
             spec = copy(spec)
-            spec.kwargs = {name: plain(value) for name, value in spec.kwargs.items()}
+            spec.kwargs = {name: to_python(value) for name, value in spec.kwargs.items()}
         self._spec = spec
 
 
@@ -262,7 +262,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         self._ahead: list[tuple[float, ...]] = []
 
     # Only `Parameters` lists the arguments; this signature shows them in help() and in editors.
-    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
+    __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from mptc_gym.env import NO_RENDER_MODE, Frame, MiddlePointEnv
 from mptc_gym.environments.batch import BatchEnv, Infos, Mask
 from mptc_gym.environments.record import Record
-from mptc_gym.plant.checks import is_count, many_actions, one_of, plain, reject
+from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_python
 from mptc_gym.plant.dynamics import PlantBatch, action_from_command
-from mptc_gym.plant.parameters import spelt_out
+from mptc_gym.plant.parameters import full_signature
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
 
@@ -121,7 +121,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         error_scale = np.array(parameters.error_scale)
         self._reward_terms = error_scale, np.array(-0.5), quadratic, parameters.move_weight
 
-    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
+    __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
@@ -294,7 +294,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             return [None] * n
         if is_count(seed):
             return range(int(seed), int(seed) + n)
-        seeds = plain(seed)
+        seeds = to_python(seed)
         is_list = isinstance(seeds, list | tuple) and len(seeds) == n
         if not is_list or not all(element is None or is_count(element) for element in seeds):
             allowed = f"None, an integer of at least 0, or a list of {n} such values"

@@ -231,7 +231,7 @@ def test_help_shows_every_argument_and_the_page_every_preset():
     for documented in (MiddlePointEnv, Parameters):
         found = inspect.getdoc(documented)
         assert f"\n\n{argument_table()}\n" in found
-        assert "\n| `delay` | 18* | samples | transport delay d of (28) |\n" in found
+        assert "\n| `delay` | 18* | samples | transport delay d in equation (28) |\n" in found
     page = (ROOT / "mptc_gym/README.md").read_text(encoding="utf-8")
     assert all(f"`{name}`" in page for name in PRESETS)
 

@@ -27,7 +27,7 @@ from mptc_gym.environments.batch import BatchEnv, Infos, Mask
 from mptc_gym.environments.making import make_one
 from mptc_gym.plant.checks import is_count, one_of, reject
 from mptc_gym.plant.dynamics import FACTORS, action_from_command
-from mptc_gym.plant.parameters import ARGUMENTS, spelt_out
+from mptc_gym.plant.parameters import ARGUMENTS, full_signature
 from mptc_gym.plant.signals import UNLIMITED, SetPointLevels
 from mptc_gym.torch_env.episodes import (
     LONGEST,
@@ -176,7 +176,7 @@ class MiddlePointTorchEnv(BatchEnv):
         self._window = _Window(self.parameters.windows, self._zeros)
         self._loads = History(self._zeros, 1)  # load w, degC
 
-    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
+    __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> MiddlePointTorchEnv:
         """Return a copy, also in mid-episode, without the gradient graph of earlier actions."""
