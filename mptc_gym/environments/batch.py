@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.env import INFO, HasPlainSpec, observation_space
+from mptc_gym.env import INFO, HasJsonSpec, observation_space
 from mptc_gym.plant.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.plant.dynamics import FACTORS
 from mptc_gym.plant.parameters import Parameters
@@ -29,7 +29,7 @@ Infos = dict[str, Any]
 Mask = NDArray[np.bool_]  # True for the selected plants, shape (num_envs,)
 
 
-class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
+class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
     """n plants that advance together: the part that does not depend on the array library.
 
     The array library is NumPy or PyTorch.

@@ -27,7 +27,7 @@ _COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # NumPy takes a dtype faster than the type np.float64
 _LONGEST_REPR = 80  # characters of a value in an error message, to keep the message readable
 # The exceptions that NumPy, PyTorch and Python raise for a value that is not a number.
-_NOT_A_NUMBER = AttributeError, TypeError, ValueError, OverflowError, RuntimeError
+NOT_A_NUMBER = AttributeError, TypeError, ValueError, OverflowError, RuntimeError
 
 Number = float | Sequence[float]  # a number, or a range [low, high]
 Check = Callable[[str, Any], Any]  # takes the name of an argument and its value
@@ -71,7 +71,7 @@ def one_action(action: Any) -> float:
     try:
         array = action if hasattr(action, "item") else np.asarray(action)
         checked = float(array.item() - 0.0)  # subtracting 0.0 fails for text such as "0.3"
-    except _NOT_A_NUMBER:
+    except NOT_A_NUMBER:
         checked = math.nan
     if not math.isfinite(checked):
         reject("action", action, "one finite number, shape (1,)")
@@ -117,7 +117,7 @@ def _as_float64(values: Any) -> NDArray[np.float64] | None:
         if array.dtype.hasobject:
             array = np.array((array - 0.0).tolist())  # subtracting 0.0 fails for text
         return array.astype(_FLOAT64, casting="same_kind")  # a cast that fails for text
-    except _NOT_A_NUMBER:
+    except NOT_A_NUMBER:
         return None
 
 
