@@ -96,7 +96,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     the commanded and u_a the applied feedwater flow (t/h), n the noise (degC), xi the white
     noise that causes n, and d the delay (samples). Call k of `step` (k = 0, 1, ...) applies the
     flow u(k), moves the plant from sample k to k+1, and returns the observation at k+1 and the
-    reward of the error e(k+1). So the flow u(0) first shows in the temperature y(19). Equation
+    reward of the error e(k+1). With d = 18, the flow u(0) first shows in y(19). Equation
     (28) is also written as A(z^-1) y(k) = B(z^-1) u_a(k-d) + C(z^-1) xi(k), with polynomials A,
     B and C.
 
@@ -117,8 +117,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times
       the dominant time constant. With p = 0.9515 the slowest pole of equation (28), the
       polynomial A is (1 - p z^-1) Q(z^-1), and the time constant is 1 / (1 - p) = 20.6 samples.
-      For t times the time constant and g times the gain, the number 1 - p is divided by t, the
-      polynomial Q stays, and the polynomial B is multiplied by g / t.
+      To multiply the time constant by t and the gain by g, the slowest pole p moves so that
+      1 - p is divided by t, and the polynomial B is multiplied by g / t; the polynomial Q stays.
     - Fouling: in `drift_samples` samples, gain and time constant drift linearly to `gain_drift`
       and `time_constant_drift` times the gain and the time constant at k = 0. The drifting
       values change every 10 samples.
@@ -161,7 +161,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     | "quadratic" | -(e(k+1) / error_scale)^2 / 2 - move_weight * abs(a(k) - a(k-1)) |
     | "absolute" | -abs(e(k+1)) / error_scale - move_weight * abs(a(k) - a(k-1)) |
 
-    The reward "quadratic" is the negative of the cost in equation (12) of the paper, scaled.
+    The reward "quadratic" is the negative of the cost in equation (12) of the paper, for the
+    error divided by `error_scale`.
     The best possible reward of a step is 0. With the default set point, a plant whose feedwater
     flow stays 0 earns -0.5 per step. The reward has no lower bound, since e is the error of the
     true temperature, which the transmitter's range does not limit.
@@ -220,7 +221,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     For an invalid argument or `render_mode`, the constructor raises a `ValueError` that names
     the argument. For an unknown argument, the constructor raises a `TypeError`. If an action is
     not one finite number, `step` raises a `ValueError` and leaves the plant unchanged. Without
-    pygame, the first picture raises `DependencyNotInstalled`.
+    pygame, the first call of `render` raises `DependencyNotInstalled`.
 
     ## Version history
 
@@ -267,8 +268,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         Parameters
         ----------
         seed
-            Restarts the environment's random number streams. Without a seed, the next episode
-            of the present streams begins.
+            Seed from which the environment's random number streams restart. Without a seed, the
+            streams move to their next episode.
         options
             Not used.
 
@@ -315,7 +316,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         return np.fromiter(self._window, _FLOAT32, size), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
-        """Apply a normalised action for one sample.
+        """Move the plant by one sample, with a normalised action.
 
         Parameters
         ----------

@@ -54,7 +54,10 @@ BY_NAME = {  # what fits together, and readings that are not always at the end o
     "u_max": st.floats(0, 20),
     "temperature_span": st.floats(0.5, 200),
 }
-STRATEGIES = {name: BY_NAME.get(name, BY_CHECK[each.check]) for name, each in ARGUMENTS.items()}
+STRATEGIES = {
+    name: BY_NAME.get(name, BY_CHECK[each.metadata["check"]])
+    for name, each in ARGUMENTS.items()
+}
 for name in PLANT_NUMBERS:
     STRATEGIES[name] |= st.lists(STRATEGIES[name], min_size=2, max_size=2).map(sorted)
 

@@ -22,7 +22,6 @@ from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant.dynamics import action_from_command
-from mptc_gym.plant.sampling import PlantSampler
 from tests.verify_bounds import CONTROLLERS, beats, errors
 
 CALM = Parameters()
@@ -44,7 +43,7 @@ def minimum_variance(parameters):
 
 def course_of(samples, **arguments):
     parameters = Parameters(**arguments)
-    return LinearModel(parameters, PlantSampler(parameters).lowest, np.arange(samples))
+    return LinearModel(parameters, parameters.lowest, np.arange(samples))
 
 
 def best_plan(setpoint, /, **arguments):

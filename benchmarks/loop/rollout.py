@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.plant.dynamics import action_from_command, least_effective_command
 from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
-from mptc_gym.plant.sampling import PlantSampler
 from mptc_gym.scoring.rollout import rollout as run_batch
 
 Array = NDArray[np.float64]
@@ -100,7 +99,7 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
     seed
         Seed of the first run: the seed of run i is `seed + i`.
     """
-    numbers = PlantSampler(parameters).lowest.select(PLANT_NUMBERS)
+    numbers = parameters.lowest.select(PLANT_NUMBERS)
     if parameters.ranges:
         _, info = make_plants(runs, 1, **asdict(parameters)).reset(seed=seed)
         for name in parameters.ranges:

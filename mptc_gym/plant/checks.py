@@ -90,8 +90,8 @@ def many_actions(
     num_envs
         Number of plants.
     ignored
-        True for each plant whose action is ignored, shape (num_envs,): the result for such a
-        plant is 0, and the action need not be finite. None if no action is ignored.
+        True for each plant whose action is ignored, shape (num_envs,): an ignored action may be
+        infinite or NaN, and becomes 0. None if no action is ignored.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def many_actions(
 
 
 def _as_float64(values: Any) -> NDArray[np.float64] | None:
-    """Return an array, list or tensor as a new float64 array; None if an element is text."""
+    """Return an array, list or tensor as a new float64 array; None if not all are numbers."""
     try:
         array = np.asarray(values)
         if array.dtype.hasobject:

@@ -100,9 +100,10 @@ class Dynamics:
     with temperature y, applied flow u_a, delay d and white noise xi. The polynomial A is (1 - p
     z^-1) Q, where p is the slowest pole. Two factors, g and t, change the plant: the
     steady-state gain is g B(1) / A(1), and the time constant is t / (1 - p) samples. The time
-    constant is the area above the step response of 1 / (1 - p z^-1), scaled to end at 1. For t
-    times the time constant, the number 1 - p is divided by t, and the polynomial Q stays. As
-    A(1) = (1 - p) Q(1) is then divided by t, the polynomial B is multiplied by g / t.
+    constant is the area above the step response of 1 / (1 - p z^-1), scaled to end at 1. To
+    multiply the time constant by t, the slowest pole p moves so that 1 - p is divided by t; the
+    polynomial Q, which holds the other poles, stays. As A(1) = (1 - p) Q(1) is then divided by
+    t, the polynomial B is multiplied by g / t.
 
     Parameters
     ----------
@@ -128,9 +129,9 @@ class Dynamics:
     def drift_share(self, age: Any) -> Any:
         """Return which share of the drifts of gain and time constant is complete at k = `age`.
 
-        The share grows linearly from 0 at sample k = 0 to 1 at sample k = `drift_samples`, and
-        then stays 1. `age` and the result are numbers, or arrays or tensors with an element for
-        each plant.
+        The share of a drift that is complete grows linearly from 0 at sample k = 0 to 1 at
+        sample k = `drift_samples`, and then stays 1. `age` and the result are numbers, or
+        arrays or tensors with an element for each plant.
         """
         share = age / self._drift_samples
         return share * (share < 1.0) + (share >= 1.0)  # at most 1, for arrays of any library
@@ -173,8 +174,8 @@ class Dynamics:
         scale : float or array
             Factor g / t of the polynomial B.
         load_gain : float or array
-            A(1) after the change of the time constant: the factor of the load w(k), by which a
-            constant load w adds w to the steady-state temperature.
+            A(1) after the change of the time constant: the factor of the load w(k), with which
+            a constant load w adds w to the steady-state temperature.
         """
         alpha: list[Any] = self._negated_a
         if self._quotient:
@@ -404,16 +405,16 @@ class PlantBatch:
     def _update_dynamics(self) -> None:
         """Compute coefficients and drift factors for the present sample k of each plant.
 
-        The dynamics of a plant change only at samples that are multiples of `DRIFT_INTERVAL`.
+        Dynamics that drift change only at samples k that are multiples of `DRIFT_INTERVAL`.
         """
         ages = self._clock - self._starts
-        last_changes = ages // DRIFT_INTERVAL * DRIFT_INTERVAL
-        factors = self._dynamics.factors(self.numbers, last_changes)
+        ages_at_change = ages // DRIFT_INTERVAL * DRIFT_INTERVAL  # at the latest change
+        factors = self._dynamics.factors(self.numbers, ages_at_change)
         if self._parameters.drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
         self._alpha = tuple(map(np.asarray, alpha))
-        samples_to_change = last_changes + DRIFT_INTERVAL - ages
+        samples_to_change = ages_at_change + DRIFT_INTERVAL - ages
         self._next_update = self._clock + int(samples_to_change.min())
 
 
@@ -421,9 +422,9 @@ class _InputResponse:
     """The part of the temperature that past flows cause, B(z^-1) u_a(k-d), for many plants.
 
     B is the polynomial of equation (28) of the paper, u_a the applied flow and d the delay, in
-    samples. With d the shortest delay that can be drawn, the flows of d + 1 samples affect no
-    temperature before the last of these flows is known. The effect of such a block of d + 1
-    flows is therefore computed when the block is complete, and then read sample by sample.
+    samples. A flow affects no temperature of the next d samples, where d is the shortest
+    possible delay. The effect of a block of d + 1 flows is therefore computed at once, when the
+    block is complete, and then read sample by sample.
 
     The flows lie in rows, one row per sample, the oldest sample first: the older flows that B
     and longer delays also need, and then the flows of the block.
@@ -472,8 +473,8 @@ class _InputResponse:
     def add(self, applied: Values) -> Values:
         """Add the applied flows of sample k, and return the effect of flows on y(k+1).
 
-        `applied` is u_a(k), t/h, shape (n,). The result is B(z^-1) u_a(k+1-d), a part of
-        y(k+1), degC, shape (n,); the caller must not modify the result.
+        `applied` holds the flows u_a(k), t/h, shape (n,). The result is B(z^-1) u_a(k+1-d), a
+        part of y(k+1), degC, shape (n,); the caller must not modify the result.
         """
         self._flows[self._older + self._next_row] = applied
         self._next_row += 1

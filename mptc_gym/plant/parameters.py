@@ -9,7 +9,7 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
-from typing import Any, Final, Generic, NamedTuple, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 
@@ -20,19 +20,14 @@ Value = TypeVar("Value")  # type of a `PlantNumbers` field: float, array, tensor
 _LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
 
-class Argument(NamedTuple):
-    """Declaration of one argument of the environment, without the argument's name and type."""
-
-    default: Any
-    check: checks.Check  # returns a valid value in Python's own types, or raises a ValueError
-    unit: str
-    meaning: str
-
-
 def _argument(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
-    """Return a dataclass field whose metadata hold an `Argument` under the key "argument"."""
-    argument = Argument(default, check, unit, meaning)
-    return field(default=default, metadata={"argument": argument})
+    """Return a dataclass field for one argument of the environment.
+
+    The metadata of the field hold the other three arguments of this function by name. `check`
+    is a function of the argument's name and value.
+    """
+    metadata = {"check": check, "unit": unit, "meaning": meaning}
+    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,9 +38,9 @@ class PlantNumbers(Generic[Value]):
     [low, high] from which each reset of the environment samples one number. During an episode,
     the fields are floats for one plant, and arrays or tensors for many plants.
 
-    At each reset, field i takes random number i of the episode. The order of the fields
-    therefore never changes, and a new field comes last: otherwise a seed would stand for
-    another plant.
+    If field i is a range, the number that a reset samples is computed from random number i of
+    the episode. The order of the fields therefore never changes, and a new field comes last:
+    otherwise a seed would stand for another plant.
     """
 
     delay: Value = _argument(
@@ -226,7 +221,7 @@ class Parameters(PlantNumbers[Number]):
 
     def __post_init__(self) -> None:
         for name, argument in ARGUMENTS.items():
-            check = argument.check
+            check = argument.metadata["check"]
             if name in PLANT_NUMBERS:
                 check = partial(checks.number_or_range, check)
             value = check(name, checks.to_python(getattr(self, name)))
@@ -245,7 +240,7 @@ class Parameters(PlantNumbers[Number]):
 
     @classmethod
     def of_environment(cls, arguments: Mapping[str, Any]) -> Parameters:
-        """Return the `Parameters` for the keyword arguments of an environment, by name.
+        """Return the `Parameters` for a dict of keyword arguments of an environment.
 
         Raises
         ------
@@ -356,16 +351,11 @@ class Parameters(PlantNumbers[Number]):
         return self.setpoint_window, self.error_window, self.output_window, self.action_window
 
 
-ARGUMENTS: Final[dict[str, Argument]] = {
-    parameter.name: parameter.metadata["argument"] for parameter in fields(Parameters)
-}
-"""The declaration of every argument, by name."""
+ARGUMENTS: Final[dict[str, Any]] = {argument.name: argument for argument in fields(Parameters)}
+"""The dataclass field of every argument, by name."""
 
 PLANT_NUMBERS: Final = {number.name: i for i, number in enumerate(fields(PlantNumbers))}
-"""The index of each field of `PlantNumbers`, by name.
-
-A field that is a range takes the random number with this index at a reset.
-"""
+"""The index of each field of `PlantNumbers`, by name: also the index of its random number."""
 
 
 def argument_table() -> str:
@@ -379,7 +369,9 @@ def argument_table() -> str:
         default = repr(argument.default).replace("'", '"')
         if name in PLANT_NUMBERS:
             default += "*"
-        rows.append(f"| `{name}` | {default} | {argument.unit} | {argument.meaning} |")
+        unit = argument.metadata["unit"]
+        meaning = argument.metadata["meaning"]
+        rows.append(f"| `{name}` | {default} | {unit} | {meaning} |")
     return "\n".join(rows)
 
 
@@ -395,9 +387,10 @@ Parameters.__doc__ = insert_table(Parameters.__doc__)
 
 
 def full_signature(constructor: Callable[..., Any]) -> inspect.Signature:
-    """Return the signature of an environment's `__init__`, for help() and editors.
+    """Return the signature of an environment's `__init__` with all arguments of `Parameters`.
 
-    All arguments of `Parameters` take the place of `**arguments`, and `self` is left out.
+    The signature, for help() and editors, has these arguments in place of `**arguments`, and no
+    `self`.
     """
     parameters = list(inspect.signature(constructor).parameters.values())
     parameters = parameters[1:-1]  # without `self` and `**arguments`

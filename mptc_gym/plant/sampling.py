@@ -66,7 +66,7 @@ class EpisodeStream:
         return duplicate
 
     def next_episode(self) -> np.random.Generator:
-        """Move to the start of the next episode and return the number generator there."""
+        """Return the generator, moved to the start of the stream's next episode."""
         if self._episode == 0:
             seeds = np.random.SeedSequence(self._entropy, spawn_key=self._spawn_key)
             self.generator = np.random.Generator(np.random.PCG64(seeds))
@@ -74,7 +74,7 @@ class EpisodeStream:
         else:
             bits: Any = self.generator.bit_generator
             bits.state = self._first_state
-            bits.advance(self._episode << 64)
+            bits.advance(self._episode * 2**64)
         self._episode += 1
         return self.generator
 
@@ -110,18 +110,13 @@ class PlantSampler:
     """Sample the plant numbers that are ranges, uniformly, at the start of each episode.
 
     Floats are sampled from [low, high), and integers from low to high, both included. Every
-    plant number has its own random number, whether the plant number is a range or not. So the
-    other plant numbers of a seed do not change if one more plant number becomes a range.
+    plant number has its own random number, whether the plant number is a range or not. So a
+    further range does not change the numbers that a seed samples for the other ranges.
 
     Parameters
     ----------
     parameters
         The arguments of the environment, of which the plant numbers may be ranges.
-
-    Attributes
-    ----------
-    lowest : PlantNumbers
-        All plant numbers, each range replaced by its low end, in arrays of shape ().
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -130,7 +125,8 @@ class PlantSampler:
         # after the random numbers that are reserved for the plant numbers.
         self._uses_stream = bool(self._ranges) or parameters.is_disturbed
         lowest = {name: np.array(number) for name, number in vars(parameters.lowest).items()}
-        self.lowest: PlantNumbers[Values] = PlantNumbers(**lowest)
+        # All plant numbers, in arrays of shape (), each range replaced by its low end.
+        self._lowest: PlantNumbers[Values] = PlantNumbers(**lowest)
 
     def sample(self, streams: Sequence[RandomStreams]) -> PlantNumbers[Values]:
         """Begin the next episode of n plants, and return the plant numbers of this episode.
@@ -148,7 +144,7 @@ class PlantSampler:
             numbers in arrays of shape ().
         """
         if not self._uses_stream:
-            return self.lowest
+            return self._lowest
         uniform = np.empty((len(streams), RESERVED_RANDOM_NUMBERS))
         for streams_of_plant, uniform_of_plant in zip(streams, uniform, strict=True):
             streams_of_plant.plant.next_episode().random(out=uniform_of_plant)
@@ -159,7 +155,7 @@ class PlantSampler:
                 numbers[name] = low + np.floor(share * (high + 1 - low)).astype(int)
             else:
                 numbers[name] = low + share * (high - low)
-        return replace(self.lowest, **numbers)
+        return replace(self._lowest, **numbers)
 
 
 def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:

@@ -1,11 +1,11 @@
 """Generate the external signals of an episode: set point, noise and load disturbance.
 
 Every signal class has three methods. `reset` begins an episode of some plants at sample k = 0.
-`next` returns the next sample of all plants. `ahead`, which is faster, returns the next
-`SAMPLES_AT_A_TIME` samples where there is one plant only.
+`next` returns the next sample of all plants. Where there is one plant only, `ahead` returns the
+next `SAMPLES_AT_A_TIME` samples, which is faster.
 
-Many random numbers are drawn in one call, which is much faster than drawing the random numbers
-one by one, and gives the same random numbers.
+Random numbers are drawn many at a time: one call is much faster than many calls, and returns
+the same random numbers.
 
 The names in formulas are those of the paper: set point y_d(k), temperature y(k), coloured noise
 n(k) = C(z^-1) xi(k) with white noise xi, and, not in the paper, load disturbance w(k).
@@ -39,8 +39,9 @@ ONLY_PLANT = np.zeros(1, np.intp)  # indices of the plants of an environment wit
 
 
 def noise_polynomials(parameters: Parameters) -> dict[str, Sequence[float]]:
-    """Return the polynomial that colours each noise whose variance can be above 0, by name.
+    """Return the coefficients of the polynomial that colours each noise, by the noise's name.
 
+    A noise whose variance is always 0 is left out.
     "noise" has the coefficients of the polynomial C of equation (28) of the paper, from z^0 on.
     "measurement_noise", the noise of the transmitter, is white: its only coefficient is 1.
     """
@@ -70,7 +71,7 @@ class Noise:
 
     def __init__(self, name: str, c: Sequence[float], num_envs: int, block: int) -> None:
         self._name = name
-        self._c = np.array(c)[:, np.newaxis, np.newaxis]
+        self._c = np.array(c)[:, np.newaxis, np.newaxis]  # two axes for plants and samples
         # Coefficients of C times the standard deviation of the white noise xi, degC, shape
         # (number of coefficients, num_envs, 1).
         self._scaled_c = np.zeros((len(c), num_envs, 1))
@@ -120,7 +121,10 @@ class Noise:
         return noise
 
     def _fill(self, plants: Indices, first_row: int) -> None:
-        """Generate noise of the plants `plants`, from `first_row` to the end of the block."""
+        """Generate the noise of some plants, from row `first_row` to the end of the block.
+
+        `plants` holds the indices of these plants.
+        """
         order = len(self._c) - 1
         samples = len(self._block) - first_row
         for start in range(0, len(plants), PLANTS_AT_A_TIME):
@@ -166,7 +170,7 @@ class SetPointLevels:
         period = parameters.setpoint_period
         self.random = setpoint == "random"
         self.amplitude = parameters.setpoint_amplitude
-        self.shortest = max(1, math.ceil(period / 6))
+        self.shortest = max(1, math.ceil(period / 6))  # samples
         self.longest = max(self.shortest, period // 2)
         self.values: list[float] = []
         self.lengths: list[int] = []
@@ -176,7 +180,7 @@ class SetPointLevels:
             if period > 1:  # a period of one sample has no second half
                 self.values.append(-self.amplitude)
                 self.lengths.append(period // 2)
-        elif isinstance(setpoint, float):
+        elif isinstance(setpoint, float):  # a constant
             self.values = [setpoint]
             self.lengths = [UNLIMITED]
         elif not isinstance(setpoint, str):  # a number for each sample, the last one held
@@ -230,7 +234,10 @@ class _HeldSignal(ABC):
 
     @abstractmethod
     def _change(self, plants: Indices) -> None:
-        """Change the values of the plants `plants`, and set the times of their next changes."""
+        """Change the values of the plants with the indices `plants`.
+
+        The method also sets the times of the next changes of these plants.
+        """
 
 
 class SetPoint(_HeldSignal):
@@ -253,10 +260,10 @@ class SetPoint(_HeldSignal):
         self._places = np.zeros(num_envs, np.intp)
 
     def reset(self, plants: Indices, streams: StreamsOfPlants) -> Values:
-        """Begin an episode of some plants, and return y_d(0), degC, shape (len(plants),).
+        """Begin an episode of the plants with the indices `plants`.
 
-        `plants` holds the indices of these plants, and `streams` the random number streams of
-        all plants.
+        The result holds the set points y_d(0) of these plants, degC, shape (len(plants),).
+        `streams` holds the random number streams of all plants.
         """
         self._streams = streams
         if self._levels.random:
@@ -354,13 +361,13 @@ class Disturbance(_HeldSignal):
 
     def ahead(self) -> list[float]:
         """Return the load at the next `SAMPLES_AT_A_TIME` samples, degC, for the only plant."""
-        self._generate(ONLY_PLANT)
+        self._generate(ONLY_PLANT)  # as the load starts at 0, a few samples are left over
         samples = [*self._surplus, *np.repeat(self._loads[0], LOAD_INTERVAL).tolist()]
         self._surplus = samples[SAMPLES_AT_A_TIME:]
         return samples[:SAMPLES_AT_A_TIME]
 
     def _change(self, plants: Indices) -> None:
-        """Take the next generated load of the plants with the indices `plants`."""
+        """Begin the next generated load of the plants with the indices `plants`."""
         used_up = self._next_columns[plants] == LOADS_AT_A_TIME
         self._generate(plants[used_up])
         columns = self._next_columns[plants]
@@ -444,9 +451,10 @@ class Signals(NamedTuple):
     def reset(
         self, plants: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
     ) -> Values:
-        """Begin an episode of some plants, and return y_d(0), degC, shape (len(plants),).
+        """Begin an episode of some plants, and return the set points y_d(0), degC.
 
-        Noise, load disturbance and measurement noise are 0 at k = 0.
+        The result has the shape (len(plants),). Noise, load disturbance and measurement noise
+        are 0 at k = 0.
 
         Parameters
         ----------

@@ -12,7 +12,7 @@ from mptc_gym.plant.parameters import Parameters, PlantNumbers, slowest_pole
 
 
 class PlantState(NamedTuple):
-    """What a teacher in training, but no policy, may know of n plants at the present sample.
+    """The present state of n plants, for a teacher in training: a policy cannot observe it.
 
     The fields are NumPy arrays of float64, or PyTorch tensors of the environment's type and on
     its device, of shape (n,).
@@ -71,7 +71,7 @@ def _nominal_gain(parameters: Parameters) -> float:
 def _nominal_time_constant(parameters: Parameters) -> float:
     """Return the time constant of the plant's slowest pole p, 1 / (1 - p) samples, in seconds.
 
-    The result is NaN unless p is real and between 0 and 1.
+    The result is NaN unless the slowest pole is real and between 0 and 1.
     """
     pole = slowest_pole(parameters.a)
     if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
