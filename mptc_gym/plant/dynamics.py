@@ -220,13 +220,14 @@ class Plant:
         self._age = 0
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()
-        # A coefficient of B is paired with the index of its flow in `_inputs`. The histories of
-        # temperatures y and flows u_a have the newest sample first: y(k), y(k-1), ... and
-        # u_a(k), u_a(k-1), ...
+        # Past temperatures and applied flows, the newest first.
         delay = int(numbers.delay)
+        self._outputs = deque([0.0] * len(self._alpha), maxlen=len(self._alpha))
+        self._flows = deque(
+            [0.0] * (delay + len(parameters.b)), maxlen=delay + len(parameters.b)
+        )
+        # Each coefficient of B with the index of its flow in `_flows`.
         self._beta = tuple(enumerate(parameters.b, start=delay))
-        self._outputs = deque([0.0] * len(self._alpha), len(self._alpha))
-        self._inputs = deque([0.0] * (delay + len(self._beta)), delay + len(self._beta))
 
     def step(self, action: float, noise: float, load: float) -> tuple[float, float, float]:
         """Move the plant from sample k to sample k+1.
@@ -262,11 +263,11 @@ class Plant:
         elif command > self._u_max:
             applied = self._u_max
         # Equation (28): the sum of B times past flows, the load, and A times past temperatures.
-        inputs = self._inputs
-        inputs.appendleft(applied)
+        flows = self._flows
+        flows.appendleft(applied)
         response = 0.0
         for lag, beta in self._beta:
-            response += beta * inputs[lag]
+            response += beta * flows[lag]
         if load:
             noise += self._load_gain * load
         output = noise + self._scale * response
@@ -282,6 +283,7 @@ class Plant:
         if self._drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
+        # Each factor of a past temperature, with the index of the temperature in `_outputs`.
         self._alpha = tuple(enumerate(alpha))
 
 
@@ -317,10 +319,13 @@ class PlantBatch:
         self._update_actuator()
 
         self._dynamics = Dynamics(parameters)
-        # Samples since the plants were created, and at the start of each plant's episode.
+        # Times of the drifts, in samples since the plants were created: the present time, the
+        # start of each plant's episode, and when the dynamics of some plant change next.
         self._clock = 0
-        self._starts = np.zeros(num_envs if parameters.drifts else (), np.int64)
-        self._next_update = 0  # the clock when the dynamics of some plant change next
+        self._starts = np.zeros((), np.int64)
+        if parameters.drifts:
+            self._starts = np.zeros(num_envs, np.int64)
+        self._next_update = 0
         self.factors: dict[str, Values] = {}
         self._update_dynamics()
         order = len(self._alpha)
