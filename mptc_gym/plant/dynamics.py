@@ -222,10 +222,9 @@ class Plant:
         self._update_dynamics()
         # Past temperatures and applied flows, the newest first.
         delay = int(numbers.delay)
+        past_flows = delay + len(parameters.b)
         self._outputs = deque([0.0] * len(self._alpha), maxlen=len(self._alpha))
-        self._flows = deque(
-            [0.0] * (delay + len(parameters.b)), maxlen=delay + len(parameters.b)
-        )
+        self._flows = deque([0.0] * past_flows, maxlen=past_flows)
         # Each coefficient of B with the index of its flow in `_flows`.
         self._beta = tuple(enumerate(parameters.b, start=delay))
 
@@ -412,7 +411,7 @@ class PlantBatch:
 
         Dynamics that drift change only at samples k that are multiples of `DRIFT_INTERVAL`.
         """
-        ages = self._clock - self._starts
+        ages = self._clock - self._starts  # the present sample k of each plant's episode
         ages_at_change = ages // DRIFT_INTERVAL * DRIFT_INTERVAL  # at the latest change
         factors = self._dynamics.factors(self.numbers, ages_at_change)
         if self._parameters.drifts:
@@ -446,20 +445,18 @@ class _InputResponse:
         self._num_envs = num_envs
         self._beta = tuple(parameters.b)
         shortest, self._longest = map(int, parameters.range_of("delay"))
-        self._block = shortest + 1  # samples in a block
+        self._block_rows = shortest + 1
         # Rows before the block, with the older flows that B and longer delays need.
-        self._older = len(self._beta) - 1 + self._longest - shortest
-        self._flows = np.zeros((self._older + self._block, num_envs))
-        self._response = np.zeros((self._block, num_envs))
+        self._older_rows = len(self._beta) - 1 + self._longest - shortest
+        self._flows = np.zeros((self._older_rows + self._block_rows, num_envs))
+        self._response = np.zeros((self._block_rows, num_envs))
         # Index of the next flow in the block. The first flow completes a block, whose other
         # flows, before k = 0, are 0.
-        self._next_row = self._block - 1
-        # If the delays differ: the flows in `_flows` that act on the block after the delay of
-        # each plant, and the indices of these flows in the flattened `_flows`.
+        self._next_row = self._block_rows - 1
+        # Needed only if the delays differ: the flows in `_flows` that act on the block after the
+        # delay of each plant, and the indices of these flows in the flattened `_flows`.
         self._delays_differ = self._longest > shortest
-        delayed_rows = 0
-        if self._delays_differ:
-            delayed_rows = len(self._beta) - 1 + self._block
+        delayed_rows = len(self._beta) - 1 + self._block_rows
         self._delayed_flows = np.zeros((delayed_rows, num_envs))
         self._delayed_indices = np.zeros((delayed_rows, num_envs), np.intp)
 
@@ -481,9 +478,9 @@ class _InputResponse:
         `applied` holds the flows u_a(k), t/h, shape (n,). The result is B(z^-1) u_a(k+1-d), a
         part of y(k+1), degC, shape (n,); the caller must not modify the result.
         """
-        self._flows[self._older + self._next_row] = applied
+        self._flows[self._older_rows + self._next_row] = applied
         self._next_row += 1
-        if self._next_row == self._block:
+        if self._next_row == self._block_rows:
             self._respond()
             self._next_row = 0
         response: Values = self._response[self._next_row]
@@ -498,5 +495,5 @@ class _InputResponse:
         self._response[:] = 0.0
         for lag, beta in enumerate(self._beta):
             first_row = len(self._beta) - 1 - lag
-            self._response += beta * flows[first_row : first_row + self._block]
-        self._flows[: self._older] = self._flows[self._block :]
+            self._response += beta * flows[first_row : first_row + self._block_rows]
+        self._flows[: self._older_rows] = self._flows[self._block_rows :]

@@ -367,9 +367,9 @@ class Disturbance(_HeldSignal):
         return samples[:SAMPLES_AT_A_TIME]
 
     def _change(self, plants: Indices) -> None:
-        """Begin the next generated load of the plants with the indices `plants`."""
-        used_up = self._next_columns[plants] == LOADS_AT_A_TIME
-        self._generate(plants[used_up])
+        """Begin the next load of the plants with the indices `plants`."""
+        needs_loads = self._next_columns[plants] == LOADS_AT_A_TIME
+        self._generate(plants[needs_loads])
         columns = self._next_columns[plants]
         self.present[plants] = self._loads[plants, columns]
         self._next_columns[plants] = columns + 1
