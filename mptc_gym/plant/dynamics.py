@@ -453,7 +453,7 @@ class _InputResponse:
         # Index of the next flow in the block. The first flow completes a block, whose other
         # flows, before k = 0, are 0.
         self._next_row = self._block_rows - 1
-        # Needed only if the delays differ: the flows in `_flows` that act on the block after the
+        # Used only if the delays differ: the flows in `_flows` that act on the block after the
         # delay of each plant, and the indices of these flows in the flattened `_flows`.
         self._delays_differ = self._longest > shortest
         delayed_rows = len(self._beta) - 1 + self._block_rows
