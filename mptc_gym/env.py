@@ -16,15 +16,15 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym.environments.record import Record
-from mptc_gym.plant.checks import one_action, one_of, plain
-from mptc_gym.plant.draws import Ranges, Streams, plant_numbers
+from mptc_gym.plant.checks import NOT_A_NUMBER, one_action, one_of, to_python
 from mptc_gym.plant.dynamics import Plant, action_from_command
-from mptc_gym.plant.parameters import Parameters, insert_table, spelt_out
-from mptc_gym.plant.signals import ONE, Signals
+from mptc_gym.plant.parameters import Parameters, full_signature, insert_table
+from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
+from mptc_gym.plant.signals import ONLY_PLANT, Signals
 
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys of every info
 _FLOAT32 = np.dtype(np.float32)  # np.fromiter takes a dtype faster than the type np.float32
-NO_MODE = (
+NO_RENDER_MODE = (  # a warning of `render`
     "render does nothing without a render mode: make the environment with a render mode, as in "
     'gymnasium.make("MiddlePoint-v0", render_mode="rgb_array")'
 )
@@ -37,25 +37,23 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
     """Return the space of an observation, a float32 `Box` of shape (size,).
 
     The bounds depend on the set point only if the set point exceeds the transmitter's range, so
-    that a policy trained on one set point can run on another. `parameters` are the arguments of
-    the environment.
+    that a policy that was trained on one set point can run on another set point.
     """
     span = parameters.temperature_span
-    setpoint = parameters.setpoint
-    if isinstance(setpoint, str):
-        setpoint = parameters.setpoint_amplitude
-    setpoint_limit = max(span, np.abs(setpoint).max())
+    setpoints = parameters.setpoint
+    if isinstance(setpoints, str):
+        setpoints = parameters.setpoint_amplitude
+    setpoint_limit = max(span, np.abs(setpoints).max())
     # The largest magnitude of a set point, of an error, of an output and of an action.
     limits = np.array([setpoint_limit, setpoint_limit + span, span, 1.0], np.float32)
     high = np.repeat(limits, parameters.windows)
     return Box(-high, high, dtype=np.float32)
 
 
-class HasPlainSpec:
+class HasJsonSpec:
     """An environment whose specification (`EnvSpec`) can be written as JSON.
 
-    The specification holds lists in place of NumPy arrays, and Python numbers in place of NumPy
-    scalars.
+    JSON has no NumPy arrays and numbers: the specification holds lists and Python numbers.
     """
 
     _spec: EnvSpec | None = None
@@ -67,14 +65,14 @@ class HasPlainSpec:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        """Store a copy of an `EnvSpec`, with lists and Python numbers for NumPy's types."""
+        """Store a copy of an `EnvSpec`, with lists and Python numbers in place of NumPy's."""
         if spec is not None:
             spec = copy(spec)
-            spec.kwargs = {name: plain(value) for name, value in spec.kwargs.items()}
+            spec.kwargs = {name: to_python(value) for name, value in spec.kwargs.items()}
         self._spec = spec
 
 
-class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
+class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     """Control the temperature at the middle point of a once-through boiler by feedwater flow.
 
     At the middle point of a once-through boiler, water becomes steam. More feedwater lowers the
@@ -83,7 +81,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     K. G. Shin, "Application of neural networks to temperature control in thermal power plants"
     (1992), here called the paper; numbers in parentheses, such as (28), are equations of this
     paper. All temperatures and flows are deviations from the operating point.
-    `MiddlePointVectorEnv` runs many of these plants at once.
+    `MiddlePointVectorEnv` runs many such plants at once.
 
     ## Plant
 
@@ -98,13 +96,13 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     the commanded and u_a the applied feedwater flow (t/h), n the noise (degC), xi the white
     noise that causes n, and d the delay (samples). Call k of `step` (k = 0, 1, ...) applies the
     flow u(k), moves the plant from sample k to k+1, and returns the observation at k+1 and the
-    reward of the error e(k+1). So the flow u(0) first shows in the temperature y(19). Equation
+    reward of the error e(k+1). With d = 18, the flow u(0) first shows in y(19). Equation
     (28) is also written as A(z^-1) y(k) = B(z^-1) u_a(k-d) + C(z^-1) xi(k), with polynomials A,
     B and C.
 
     Section 1 of the paper names further difficulties of a boiler that equation (28) does not
-    include. These difficulties are off by default; some of the argument sets in
-    `mptc_gym.PRESETS` turn the difficulties on:
+    include. The following difficulties are off by default, and on in some of the argument sets
+    in `mptc_gym.PRESETS`:
 
     - Measurement noise: from k = 1 on, the observation shows the reading y + v in place of the
       temperature y, with white noise v ~ N(0, measurement_noise_variance). The reward and
@@ -119,8 +117,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times
       the dominant time constant. With p = 0.9515 the slowest pole of equation (28), the
       polynomial A is (1 - p z^-1) Q(z^-1), and the time constant is 1 / (1 - p) = 20.6 samples.
-      For t times the time constant and g times the gain, the number 1 - p is divided by t, the
-      polynomial Q stays, and the polynomial B is multiplied by g / t.
+      To multiply the time constant by t and the gain by g, the slowest pole p moves so that
+      1 - p is divided by t, and the polynomial B is multiplied by g / t; the polynomial Q stays.
     - Fouling: in `drift_samples` samples, gain and time constant drift linearly to `gain_drift`
       and `time_constant_drift` times the gain and the time constant at k = 0. The drifting
       values change every 10 samples.
@@ -150,8 +148,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     | outputs y(k), y(k-1), ... | `output_window` (0) | +-50 | degC |
     | actions a(k-1), a(k-2), ... | `action_window` (0) | +-1 | 1 |
 
-    The defaults give the six inputs of the paper's neural network. Past actions are clipped to
-    +-1, as the actuator limits the commands of actions beyond +-1. With
+    The default observation is the six inputs of the paper's neural network. Past actions are
+    clipped to +-1, as the actuator limits the commands of actions beyond +-1. With
     `action_window=delay+2`, the problem without noise is a Markov decision process as long as
     the set point stays constant. If the set point can exceed the transmitter's range, the
     bounds of set points and errors widen to include the set point.
@@ -163,7 +161,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     | "quadratic" | -(e(k+1) / error_scale)^2 / 2 - move_weight * abs(a(k) - a(k-1)) |
     | "absolute" | -abs(e(k+1)) / error_scale - move_weight * abs(a(k) - a(k-1)) |
 
-    The reward "quadratic" is the negative of the cost in equation (12) of the paper, scaled.
+    The reward "quadratic" is the negative of the cost in equation (12) of the paper, for the
+    error divided by `error_scale`.
     The best possible reward of a step is 0. With the default set point, a plant whose feedwater
     flow stays 0 earns -0.5 per step. The reward has no lower bound, since e is the error of the
     true temperature, which the transmitter's range does not limit.
@@ -183,9 +182,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     ## Arguments
 
     All arguments are keyword-only and can be given to `gymnasium.make`. An asterisk marks an
-    argument that can also be a range [low, high], from which each `reset` draws a number
-    uniformly (an integer where the default is an integer). In the table, U_min and U_max are
-    the paper's symbols, and A, B, C and xi those of equation (28).
+    argument that can be a range [low, high], from which each `reset` samples a number uniformly
+    (an integer where the default is an integer).
 
     <arguments>
 
@@ -197,13 +195,12 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
 
     `reset` and `step` return a new dict of floats: `output` (the true y, degC), `setpoint`
     (y_d, degC), `error` (y_d - y, degC), `command` (u, t/h), `applied` (u_a, t/h) and `noise`
-    (n, degC). After the step from sample k to k+1, `command` and `applied` are those of the
-    step, u(k) and u_a(k), and the other values are those of sample k+1. At reset, `command`,
-    `applied` and `noise` are 0.
+    (n, degC). The step from sample k to k+1 returns the flows u(k) and u_a(k), and y(k+1),
+    y_d(k+1), e(k+1) and n(k+1). At reset, `command`, `applied` and `noise` are 0.
 
     With a load disturbance, the info also holds `disturbance` (w, degC). With a drift, the info
     also holds the present `gain_factor` and `time_constant_factor`. The info of `reset` also
-    holds the number that was drawn for each argument that is a range, under the argument's
+    holds the number that was sampled for each argument that is a range, under the argument's
     name; a delay is an int.
 
     ## Rendering
@@ -211,20 +208,20 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
     | `render_mode` | `render` |
     |---|---|
     | "rgb_array" | returns a picture, shape (540, 960, 3), uint8 |
-    | "human" | shows the picture in a window, as do `reset` and `step`, at most `metadata["render_fps"]` times a second |
+    | "human" | shows the picture in a window; `reset` and `step` call `render`, at most `metadata["render_fps"]` times a second |
 
     A picture shows the latest 200 samples, or more if the delay is long. The upper panel shows
     set point and true temperature. The lower panel shows commanded and applied flow, the dead
     zone, the limits, and the time in which the flow is still in transit to the middle point.
-    Pictures need pygame:
-    `pip install "mptc_gym[render]"`. Gymnasium's `RecordVideo` also needs moviepy.
+    Pictures need pygame: `pip install "mptc_gym[render]"`. Gymnasium's `RecordVideo` also needs
+    moviepy.
 
     ## Errors
 
     For an invalid argument or `render_mode`, the constructor raises a `ValueError` that names
     the argument. For an unknown argument, the constructor raises a `TypeError`. If an action is
     not one finite number, `step` raises a `ValueError` and leaves the plant unchanged. Without
-    pygame, the first picture raises `DependencyNotInstalled`.
+    pygame, the first call of `render` raises `DependencyNotInstalled`.
 
     ## Version history
 
@@ -245,24 +242,23 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = observation_space(parameters)
         # `step` unpacks two tuples, which is faster than reading as many attributes.
-        quadratic = parameters.reward == "quadratic"
-        self._reward_terms = parameters.error_scale, quadratic, parameters.move_weight
+        is_quadratic = parameters.reward == "quadratic"
+        self._reward_terms = parameters.error_scale, is_quadratic, parameters.move_weight
         # The indices at which errors, outputs and actions begin in the observation, and the
         # number of elements of the observation.
-        places = np.cumsum(parameters.windows).tolist()
-        self._layout = parameters.temperature_span, *places
+        self._layout = tuple(np.cumsum(parameters.windows).tolist())
         self._has_more_info = parameters.is_disturbed or parameters.drifts
-        self._ranges = Ranges(parameters)
+        self._plant_sampler = PlantSampler(parameters)
         self._signals = Signals.of(parameters)
         # Random number streams of the only plant; empty before the first reset.
-        self._streams: list[Streams] = []
+        self._streams: list[RandomStreams] = []
         self._root: np.random.Generator | None = None  # whose seed the streams come from
         # Set point y_d, noise n, load w and measurement noise, degC, of the samples to come,
         # the next sample last.
-        self._ahead: list[tuple[float, ...]] = []
+        self._coming_signals: list[tuple[float, ...]] = []
 
-    # Only `Parameters` lists the arguments; this signature shows them in help() and in editors.
-    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
+    # Only `Parameters` lists all arguments, so help() and editors need this signature.
+    __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -272,8 +268,8 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         Parameters
         ----------
         seed
-            Restarts the environment's random number streams. Without a seed, the next episode
-            of the present streams begins.
+            Seed from which the environment's random number streams restart. Without a seed, the
+            streams move to their next episode.
         options
             Not used.
 
@@ -282,30 +278,30 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         observation : ndarray of float32
             The observation at sample k = 0, shape (size,), laid out as in the class docstring.
         info : dict of float
-            The info at sample k = 0, and the numbers that were drawn for ranges.
+            The info at sample k = 0, and the numbers that were sampled for ranges.
         """
         super().reset(seed=seed)
-        if self._root is not self.np_random:
+        if self._root is not self.np_random:  # at the first reset, or after a new seed
             self._root = self.np_random
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
-            self._streams = [Streams.spawn(seeds)]
-        numbers_of_plants = self._ranges.draw(self._streams)
-        setpoint = self._signals.reset(ONE, self._streams, numbers_of_plants).item()
-        numbers = plant_numbers(numbers_of_plants, 0)
+            self._streams = [RandomStreams.spawn(seeds)]
+        arrays_of_numbers = self._plant_sampler.sample(self._streams)
+        setpoint = self._signals.reset(ONLY_PLANT, self._streams, arrays_of_numbers).item()
+        numbers = plant_numbers(arrays_of_numbers, 0)
         self._plant = Plant(self.parameters, numbers)
-        self._ahead.clear()
+        self._coming_signals.clear()
 
         # At rest, the commanded flow is 0 t/h. The action for 0 t/h depends on the limits.
         self._action = action_from_command(0.0, numbers.u_min, numbers.u_max)
-        rest_action = _limited(self._action, 1.0)
-        _, error_place, output_place, action_place, size = self._layout
+        rest_action = _clip(self._action, 1.0)
+        error_index, output_index, action_index, size = self._layout
         # `step` writes to one more element after the end of the observation.
-        self._window = [0.0] * action_place + [rest_action] * (size - action_place + 1)
+        self._window = [0.0] * action_index + [rest_action] * (size - action_index + 1)
         # A block of size 0 begins where the next block does, whose element is written later.
         self._window[0] = setpoint
-        self._window[error_place] = setpoint
-        self._window[output_place] = 0.0
-        self._window[action_place] = rest_action
+        self._window[error_index] = setpoint
+        self._window[output_index] = 0.0
+        self._window[action_index] = rest_action
         if self.render_mode is not None:
             self._record = Record(numbers, self.parameters.sampling_interval, setpoint)
         if self.render_mode == "human":
@@ -316,11 +312,11 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         if self.parameters.is_disturbed:
             info["disturbance"] = 0.0
         info |= self._plant.factors
-        info |= numbers.chosen(self.parameters.ranges)
+        info |= numbers.select(self.parameters.ranges)
         return np.fromiter(self._window, _FLOAT32, size), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
-        """Apply a normalised action for one sample.
+        """Move the plant by one sample, with a normalised action.
 
         Parameters
         ----------
@@ -348,44 +344,44 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         # The speed of the environment depends on this method, so it avoids function calls.
         try:
             a = float(action.item() - 0.0)  # subtracting 0.0 fails for text such as "0.3"
-        except (AttributeError, TypeError, ValueError, OverflowError, RuntimeError):
+        except NOT_A_NUMBER:
             a = one_action(action)
         observed_action = a
         if not -1.0 <= a <= 1.0:
-            observed_action = _limited(a, 1.0)
+            observed_action = _clip(a, 1.0)
             if not math.isfinite(a):
                 one_action(a)  # raises a ValueError, as the action is not finite
-        if not self._ahead:
+        if not self._coming_signals:
             if not self._streams:
                 raise ResetNeeded("call reset before step")
-            self._ahead = self._signals.ahead()[::-1]
-        setpoint, noise, load, transmitter_noise = self._ahead.pop()
-        error_scale, quadratic, move_weight = self._reward_terms
-        span, error_place, output_place, action_place, size = self._layout
+            self._coming_signals = self._signals.ahead()[::-1]
+        setpoint, noise, load, measurement_noise = self._coming_signals.pop()
 
         command, applied, output = self._plant.step(a, noise, load)
         error = setpoint - output
-        scaled = error / error_scale
+        error_scale, is_quadratic, move_weight = self._reward_terms
+        scaled_error = error / error_scale
         # The paper's cost, equation (12), negated, or the magnitude of the error, negated.
-        reward = scaled * scaled * -0.5 if quadratic else -abs(scaled)
+        reward = scaled_error * scaled_error * -0.5 if is_quadratic else -abs(scaled_error)
         if move_weight:
             reward -= move_weight * abs(a - self._action)
         self._action = a
 
-        measured = output + transmitter_noise
-        if not -span <= measured <= span:
-            measured = _limited(measured, span)
-        # One insertion shifts all blocks of the observation by one place. The oldest element of
-        # a block moves to the first place of the next block, where the new sample overwrites
-        # the oldest element. A block of size 0 begins where the next block does, whose element
-        # is written later; if the last block has size 0, the last block begins at the
-        # additional element at the end of the list.
+        reading = output + measurement_noise
+        span = self.parameters.temperature_span
+        if not -span <= reading <= span:
+            reading = _clip(reading, span)
+        # One insertion shifts all blocks of the observation by one element. The oldest element
+        # of a block then has the first index of the next block, whose new sample replaces it.
+        # A block of size 0 begins where the next block does, whose element is written later; an
+        # empty last block begins at the additional element at the end of the list.
+        error_index, output_index, action_index, size = self._layout
         window = self._window
         window.insert(0, setpoint)
         window.pop()
-        window[error_place] = setpoint - measured
-        window[output_place] = measured
-        window[action_place] = observed_action
+        window[error_index] = setpoint - reading
+        window[output_index] = reading
+        window[action_index] = observed_action
         observation = np.fromiter(window, _FLOAT32, size)  # faster than np.array
         info = {
             "output": output,
@@ -406,7 +402,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
         return observation, reward, False, False, info
 
     def render(self) -> Frame | None:
-        """Return or show a picture of the latest samples of the episode.
+        """Return a picture of the latest samples of the episode, or show it in a window.
 
         Returns
         -------
@@ -423,7 +419,7 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
             If pygame is not installed.
         """
         if self.render_mode is None:
-            logger.warn(NO_MODE)
+            logger.warn(NO_RENDER_MODE)
             return None
         if self._record is None:
             raise ResetNeeded("call reset before render")
@@ -446,6 +442,6 @@ class MiddlePointEnv(HasPlainSpec, gymnasium.Env[Observation, Action]):
 MiddlePointEnv.__doc__ = insert_table(MiddlePointEnv.__doc__)
 
 
-def _limited(value: float, limit: float) -> float:
-    """Return a value, limited to +-`limit`; NaN becomes the upper limit."""
+def _clip(value: float, limit: float) -> float:
+    """Return a value clipped to +-`limit`; NaN becomes the upper limit."""
     return max(-limit, min(limit, value))

@@ -13,14 +13,14 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.env import NO_MODE, Frame, MiddlePointEnv
+from mptc_gym.env import NO_RENDER_MODE, Frame, MiddlePointEnv
 from mptc_gym.environments.batch import BatchEnv, Infos, Mask
 from mptc_gym.environments.record import Record
-from mptc_gym.plant.checks import is_count, many_actions, one_of, plain, reject
-from mptc_gym.plant.draws import Ranges, Streams, plant_numbers
+from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_python
 from mptc_gym.plant.dynamics import PlantBatch, action_from_command
-from mptc_gym.plant.parameters import spelt_out
-from mptc_gym.plant.signals import BLOCK, Indices, Signals, Values
+from mptc_gym.plant.parameters import full_signature
+from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
+from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 
@@ -98,13 +98,13 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self.render_mode = render_mode
         # Random number streams and, if pictures are wanted, records of episodes, by the index
         # of the plant. Both dicts are empty before the first reset.
-        self._streams: dict[int, Streams] = {}
+        self._streams: dict[int, RandomStreams] = {}
         self._records: dict[int, Record] = {}
         self._seeds: list[int | None] = [None] * num_envs
-        self._ranges = Ranges(parameters)
+        self._plant_sampler = PlantSampler(parameters)
         # Blocks of noise end with an episode, so that no noise is generated in vain. Where many
         # plants would need much memory, the blocks are shorter, which is slower.
-        longest = max(1, min(BLOCK, NOISE_BYTES // (8 * num_envs)))
+        longest = max(1, min(SAMPLES_AT_A_TIME, NOISE_BYTES // (8 * num_envs)))
         block = math.ceil(self._limit / math.ceil(self._limit / longest))
         self._signals = Signals.of(parameters, num_envs, block)
         self._plants = PlantBatch(parameters, num_envs)
@@ -121,7 +121,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         error_scale = np.array(parameters.error_scale)
         self._reward_terms = error_scale, np.array(-0.5), quadratic, parameters.move_weight
 
-    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
+    __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
@@ -141,7 +141,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             If pygame is not installed.
         """
         if self.render_mode is None:
-            logger.warn(NO_MODE)
+            logger.warn(NO_RENDER_MODE)
             return None
         if not self._records:
             raise ResetNeeded("call reset before render")
@@ -226,7 +226,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         meaning.
         """
         which = np.flatnonzero(mask)
-        numbers = self._ranges.draw([self._streams[i] for i in which.tolist()])
+        numbers = self._plant_sampler.sample([self._streams[i] for i in which.tolist()])
         self._plants.reset(which, numbers)
         setpoint = self._signals.reset(which, self._streams, numbers)
         rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)
@@ -240,7 +240,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
         infos: dict[str, NDArray[Any]] = {**self._plants.factors}
         infos_of_which = {"setpoint": setpoint, "error": setpoint}
-        infos_of_which |= numbers.chosen(self.parameters.ranges)
+        infos_of_which |= numbers.select(self.parameters.ranges)
         for name, values in infos_of_which.items():
             infos[name] = np.zeros(self.num_envs, values.dtype)
             infos[name][which] = values
@@ -266,7 +266,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         load = self._zeros
         if self._signals.disturbance is not None:
             load = self._signals.disturbance.present
-        return self._plants.numbers.chosen(self.parameters.ranges), load
+        return self._plants.numbers.select(self.parameters.ranges), load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Start new random number streams for plants in `mask` that get a seed from `reset`.
@@ -281,7 +281,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
                 seed_of_plant = np.random.SeedSequence().entropy
             if seed_of_plant is not None:
                 self._seeds[i] = int(seed_of_plant)
-                self._streams[i] = Streams.of_seed(int(seed_of_plant))
+                self._streams[i] = RandomStreams.of_seed(int(seed_of_plant))
 
     def _checked_seeds(self, seed: Any) -> Sequence[Any]:
         """Return the seed of each plant, with None for plants whose random streams continue.
@@ -294,7 +294,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             return [None] * n
         if is_count(seed):
             return range(int(seed), int(seed) + n)
-        seeds = plain(seed)
+        seeds = to_python(seed)
         is_list = isinstance(seeds, list | tuple) and len(seeds) == n
         if not is_list or not all(element is None or is_count(element) for element in seeds):
             allowed = f"None, an integer of at least 0, or a list of {n} such values"

@@ -1,14 +1,14 @@
 """Fixtures and helpers that several test files use."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
 
-# Before NumPy and PyTorch are loaded: the processes of the tests share the cores already.
+# NumPy and PyTorch read these variables when they are imported below. The tests' processes
+# already share the cores, so that further threads would only slow the tests down.
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-os.environ["SDL_VIDEODRIVER"] = "dummy"  # windows that nobody sees
+os.environ["SDL_VIDEODRIVER"] = "dummy"  # pygame then opens no window
 
 import gymnasium
 import numpy as np
@@ -28,53 +28,65 @@ if not os.access(ROOT, os.W_OK):
     # Hypothesis keeps failing examples in the checkout, and warns where it cannot.
     settings.register_profile("read-only", database=None)
     settings.load_profile("read-only")
-# What a step test shows of the paper's plant, nearly of first order: all that some are told.
+# What a step test shows of the paper's plant, which is nearly of first order. Some controllers
+# have no other prior knowledge. The units are degC per t/h and s.
 STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
 
-few = st.floats(-0.3, 0.3)
-tails = st.lists(few, max_size=3).map(lambda tail: [1.0, *tail])
-levels = st.floats(-100, 100)
+small_numbers = st.floats(-0.3, 0.3)
+polynomials = st.lists(small_numbers, max_size=3).map(lambda tail: [1.0, *tail])
+setpoints = st.floats(-100, 100)
+# The strategy of an argument, by the check of the argument.
 BY_CHECK = {
-    checks.number: few,
+    checks.number: small_numbers,
     checks.samples: st.integers(0, 30),
     checks.duration: st.integers(1, 100),
     checks.not_negative: st.floats(0, 4),
     checks.at_least_1: st.floats(1, 100),
     checks.positive: st.floats(0.5, 4),
-    checks.polynomial: tails,
-    checks.numbers: st.lists(few, min_size=1, max_size=5),
+    checks.polynomial: polynomials,
+    checks.numbers: st.lists(small_numbers, min_size=1, max_size=5),
     checks.reward: st.sampled_from(checks.REWARDS),
     checks.setpoint: st.sampled_from(checks.SETPOINTS)
-    | levels
-    | st.lists(levels, min_size=1, max_size=5),
+    | setpoints
+    | st.lists(setpoints, min_size=1, max_size=5),
 }
-BY_NAME = {  # what fits together, and readings that are not always at the end of the span
+# Values of the actuator that fit together, and spans that readings often do not exceed.
+BY_NAME = {
     "dead_zone": st.floats(0, 10),
     "u_min": st.floats(-20, -10),
     "u_max": st.floats(0, 20),
     "temperature_span": st.floats(0.5, 200),
 }
-STRATEGIES = {name: BY_NAME.get(name, BY_CHECK[each.check]) for name, each in ARGUMENTS.items()}
+STRATEGIES = BY_NAME | {
+    name: BY_CHECK[argument.metadata["check"]]
+    for name, argument in ARGUMENTS.items()
+    if name not in BY_NAME
+}
 for name in PLANT_NUMBERS:
     STRATEGIES[name] |= st.lists(STRATEGIES[name], min_size=2, max_size=2).map(sorted)
 
 
-def _without(refused):
-    chosen = {name: each for name, each in STRATEGIES.items() if not re.match(refused, name)}
-    return st.fixed_dictionaries({}, optional=chosen)
+def _arguments_without(*names):
+    """Return a strategy of dicts with any arguments of the environment, except these names."""
+    strategies = {name: STRATEGIES[name] for name in STRATEGIES if name not in names}
+    return st.fixed_dictionaries({}, optional=strategies)
 
 
-# Of all that is valid: another A, or other time constants of the paper's A, as not every A has
-# one to change; and an observation with at least one element.
-valid_arguments = (_without("a$") | _without("time_constant")).filter(
-    lambda arguments: any(arguments.get(name, ARGUMENTS[name].default) for name in WINDOWS)
+def _has_observation(arguments):
+    return any(arguments.get(name, ARGUMENTS[name].default) for name in WINDOWS)
+
+
+# Not every polynomial A has a time constant that can be changed, but the default A has.
+valid_arguments = _arguments_without("a") | _arguments_without(
+    "time_constant_factor", "time_constant_drift"
 )
+valid_arguments = valid_arguments.filter(_has_observation)
 MODES = [mode.value for mode in AutoresetMode]
 NOISY = {"noise_variance": 0.5, "setpoint": "random", "setpoint_period": 60}
 
 
 def run(env, actions, seed=0):
-    """Reset, take all actions, and return observations, rewards and infos, k = 0 first.
+    """Run an episode, and return observations, rewards and infos by name, k = 0 first.
 
     An action may be a function of the observation.
     """
@@ -93,7 +105,7 @@ def run(env, actions, seed=0):
 
 
 def native_and_sync(num_envs, mode, limit=None, wrappers=(), **arguments):
-    """Return the vector environment, and Gymnasium's of one (wrapped) after the other."""
+    """Return the native vector environment, and a SyncVectorEnv of scalar environments."""
     native = gymnasium.make_vec(
         "MiddlePoint-v0", num_envs, max_episode_steps=limit, autoreset_mode=mode, **arguments
     )
@@ -106,9 +118,9 @@ def native_and_sync(num_envs, mode, limit=None, wrappers=(), **arguments):
     return native, sync
 
 
-def python(*words, **options):
-    """Run Python with these words, in the checkout."""
-    command = [sys.executable, *words]
+def python(*arguments, **options):
+    """Run Python with these arguments in the checkout, and return the completed process."""
+    command = [sys.executable, *arguments]
     options = {"cwd": ROOT, "capture_output": True, "text": True, "timeout": 300.0, **options}
     return subprocess.run(command, **options)
 
@@ -121,15 +133,15 @@ def random_actions(rng, n):
     return actions
 
 
-def assert_the_seed_is_all_that_differs(made):
-    """Make it twice with a seed and once with another, and compare."""
-    first, again, other = (np.asarray(made(seed)) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
+def assert_the_seed_is_all_that_differs(make):
+    """Check that `make(seed)` returns equal arrays for equal seeds alone."""
+    array = make(1)
+    np.testing.assert_array_equal(array, make(1))
+    assert not np.array_equal(array, make(2))
 
 
 def trajectory(setpoint, output, command=None, applied=None):
-    """Return one run, of columns, as if each step led to its own sample."""
+    """Return the trajectory of one run, whose next set points are the present ones."""
     command = np.zeros(len(setpoint)) if command is None else command
     applied = command if applied is None else applied
     columns = setpoint, output, command, applied, np.subtract(setpoint, output), setpoint
@@ -143,15 +155,15 @@ def rng():
 
 @pytest.fixture
 def refused(capsys):
-    """Return a function that runs a command, and returns with which words it refuses."""
+    """Return a function that runs a command, and returns the message with which it refuses."""
 
-    def refused(main, given):
-        capsys.readouterr()  # what came before
+    def message(main, arguments):
+        capsys.readouterr()  # drops what was printed before
         with pytest.raises(SystemExit) as stop:
-            main([str(each) for each in given])
+            main([str(argument) for argument in arguments])
         assert stop.value.code == 2
         printed = capsys.readouterr()
         assert printed.out == ""
         return printed.err
 
-    return refused
+    return message

@@ -21,7 +21,6 @@ from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
 from mptc_gym import PRESETS, Parameters
-from mptc_gym.plant.draws import Ranges
 from mptc_gym.plant.dynamics import action_from_command
 from tests.verify_bounds import CONTROLLERS, beats, errors
 
@@ -44,7 +43,7 @@ def minimum_variance(parameters):
 
 def course_of(samples, **arguments):
     parameters = Parameters(**arguments)
-    return LinearModel(parameters, Ranges(parameters).lowest, np.arange(samples))
+    return LinearModel(parameters, parameters.lowest, np.arange(samples))
 
 
 def best_plan(setpoint, /, **arguments):

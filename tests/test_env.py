@@ -1,4 +1,4 @@
-"""The environment as its specification describes it, and what is off by default."""
+"""Check the environment against its specification, also what is off by default."""
 
 import dataclasses
 import inspect
@@ -24,19 +24,19 @@ INFO = {"output", "setpoint", "error", "command", "applied", "noise"}
 
 @pytest.mark.parametrize("kind", [MiddlePointEnv, MiddlePointVectorEnv])
 def test_help_shows_which_arguments_may_be_ranges(kind):
-    shown = inspect.signature(kind).parameters
-    types = {name: shown[name].annotation for name in PLANT_NUMBERS}
-    assert set(types.values()) == {"float | Sequence[float]"}
-    assert shown["setpoint_period"].annotation == "int"
-    assert shown["temperature_span"].annotation == "float"
-    assert shown["reward"].annotation == "str"
+    parameters = inspect.signature(kind).parameters
+    types = {name: parameters[name].annotation for name in parameters}
+    assert {types[name] for name in PLANT_NUMBERS} == {"float | Sequence[float]"}
+    assert types["setpoint_period"] == "int"
+    assert types["temperature_span"] == "float"
+    assert types["reward"] == "str"
 
 
 @pytest.mark.parametrize("library", ["gymnasium.utils", "stable_baselines3.common"])
 @settings(max_examples=8, deadline=None)
 @given(arguments=valid_arguments)
 def test_the_checker_of_a_library_is_content_with_any_valid_arguments(library, arguments):
-    checker = pytest.importorskip(f"{library}.env_checker", reason="it is what checks")
+    checker = pytest.importorskip(f"{library}.env_checker", reason="the library's own checks")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         checker.check_env(gymnasium.make("MiddlePoint-v0", **arguments).unwrapped)
@@ -48,7 +48,7 @@ def test_the_checker_of_a_library_is_content_with_any_valid_arguments(library, a
     actions=st.lists(st.floats(-1e3, 1e3, width=32), min_size=1, max_size=60),
     seed=st.integers(0, 2**31),
 )
-@example({"a": [1.0, -3.0, 4.0], "output_window": 1}, [1.0] * 1500, 0)  # beyond all floats
+@example({"a": [1.0, -3.0, 4.0], "output_window": 1}, [1.0] * 1500, 0)  # outputs overflow
 def test_observations_stay_in_their_space_whatever_the_actions(arguments, actions, seed):
     env = MiddlePointEnv(**arguments)
     record = run(env, np.array(actions, dtype=np.float32), seed)
@@ -74,12 +74,12 @@ def test_reset_is_at_rest():
     assert list(observation) == [5, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0]
     rest = {"output": 0.0, "command": 0.0, "applied": 0.0, "noise": 0.0}
     assert info == {"setpoint": 5.0, "error": 5.0, **rest}
-    # Of an unsymmetric actuator: u = 0 is a quarter of the way up.
+    # With these unsymmetric limits, a flow of 0 lies a quarter of the range above u_min.
     env = MiddlePointEnv(u_min=-5.0, u_max=15.0, action_window=2, move_weight=1.0)
     observation, _ = env.reset(seed=0)
     assert list(observation[-2:]) == [-0.5, -0.5]
     _, reward, *_ = env.step(np.array([-0.5], np.float32))
-    assert reward == -0.5  # no move, so only the error costs
+    assert reward == -0.5  # of the error alone, as the action has not changed
 
 
 def test_timeline_by_hand():
@@ -111,7 +111,6 @@ def test_timeline_by_hand():
 def test_noise_and_set_point_come_from_the_seed_alone_in_separate_streams(others, alone, rng):
     arguments = {"noise_variance": 0.5, "setpoint": "random"}
     first = run(MiddlePointEnv(**arguments), rng.uniform(-1, 1, 600))
-    # Whatever the controller does.
     second = run(MiddlePointEnv(**arguments | others), rng.uniform(-1, 1, 600))
     for key in alone:
         np.testing.assert_array_equal(first[key], second[key])
@@ -129,7 +128,7 @@ def test_info_is_made_of_floats_and_counts_of_ints():
 
 NAN, INF = float("nan"), float("inf")
 BAD = {
-    # Some of these would fill the memory, or take hours.
+    # Some of these values would fill the memory or take hours, if they were accepted.
     "delay": [1.5, -1, "18", True, 10**12, 10_001, [3, 2]],
     "dead_zone": [-0.1, 10.1, NAN, "5", [1, 2, 3], (0.0, 11.0)],
     "u_min": [10.0, 11.0, -INF, (-10.0, 10.0)], "u_max": [INF], "gain_factor": [0.0],
@@ -171,32 +170,33 @@ def test_what_does_not_fit_together_is_named():
             MiddlePointEnv(**arguments)
 
 
-@pytest.mark.parametrize("made", [gymnasium.make, partial(gymnasium.make_vec, num_envs=2)])
-def test_misspelt_argument_is_refused_and_the_right_one_named(made):
+@pytest.mark.parametrize("make", [gymnasium.make, partial(gymnasium.make_vec, num_envs=2)])
+def test_misspelt_argument_is_refused_and_the_right_one_named(make):
     message = "MiddlePoint-v0 got an unexpected keyword argument "
     for name, hint in {"dead_zon": r": did you mean 'dead_zone'\?", "xyz": ""}.items():
         with pytest.raises(TypeError, match=f"{message}'{name}'{hint}"):
-            made("MiddlePoint-v0", **{name: 5.0})
+            make("MiddlePoint-v0", **{name: 5.0})
 
 
 @pytest.mark.parametrize(
-    "given",
+    "lists",
     [
         {"a": [1.0, -0.5], "b": [0.5], "c": [1.0, 0.25], "delay": [12, 24], "setpoint": [1, 2]},
         {"delay": 7, "dead_zone": 2.0, "setpoint": 1.0, "noise_variance": [0.5, 1.0]},
     ],
 )
-def test_arrays_are_taken_where_lists_are_and_are_plain_in_the_spec(given):
-    wanted = MiddlePointEnv(**given).parameters
-    arrays = {name: np.array(value) for name, value in given.items()}
-    numbers = {name: np.float32(2) for name in given if name == "dead_zone"}
-    env = gymnasium.make("MiddlePoint-v0", **arrays | numbers)
-    again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
-    assert env.unwrapped.parameters == again.unwrapped.parameters == wanted
-    json.dumps(dataclasses.asdict(env.unwrapped.parameters))  # takes nothing of NumPy
+def test_arrays_are_taken_where_lists_are_and_are_lists_in_the_spec(lists):
+    parameters = MiddlePointEnv(**lists).parameters
+    arrays = {name: np.array(value) for name, value in lists.items()}
+    if "dead_zone" in lists:
+        arrays["dead_zone"] = np.float32(2)
+    env = gymnasium.make("MiddlePoint-v0", **arrays)
+    copied_env = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+    assert env.unwrapped.parameters == copied_env.unwrapped.parameters == parameters
+    json.dumps(dataclasses.asdict(env.unwrapped.parameters))  # fails for the types of NumPy
     envs = gymnasium.make_vec("MiddlePoint-v0", 2, **arrays)
-    kept = EnvSpec.from_json(envs.spec.to_json()).kwargs
-    assert Parameters(**{name: kept[name] for name in given}) == wanted
+    arguments = EnvSpec.from_json(envs.spec.to_json()).kwargs
+    assert Parameters(**{name: arguments[name] for name in lists}) == parameters
     for name, value in {"setpoint": np.ones((2, 2)), "delay": np.array([12.0, 24.0])}.items():
         with pytest.raises(ValueError, match=f"{name} must be"):
             MiddlePointEnv(**{name: value})
@@ -229,9 +229,9 @@ def test_bad_action_leaves_the_plant_untouched():
 def test_help_shows_every_argument_and_the_page_every_preset():
     assert "`render_mode`" in MiddlePointEnv.__doc__
     for documented in (MiddlePointEnv, Parameters):
-        found = inspect.getdoc(documented)
-        assert f"\n\n{argument_table()}\n" in found
-        assert "\n| `delay` | 18* | samples | transport delay d of (28) |\n" in found
+        text = inspect.getdoc(documented)
+        assert f"\n\n{argument_table()}\n" in text
+        assert "\n| `delay` | 18* | samples | transport delay d in equation (28) |\n" in text
     page = (ROOT / "mptc_gym/README.md").read_text(encoding="utf-8")
     assert all(f"`{name}`" in page for name in PRESETS)
 
@@ -248,7 +248,7 @@ def test_help_shows_every_argument_and_the_page_every_preset():
     ],
 )
 def test_stored_trajectory(arguments, outputs, setpoint):
-    # No proof of anything, as it was made by this code: it notices when v0 changes.
+    # These numbers were computed by this code: the test notices if v0 changes.
     record = run(MiddlePointEnv(**arguments), (np.arange(400) % 21 - 10) / 10, seed=42)
     assert record["output"][[20, 100, 400]] == pytest.approx(outputs, rel=1e-12)
     assert record["setpoint"][400] == pytest.approx(setpoint, rel=1e-12)
@@ -267,8 +267,9 @@ EVERYTHING = {
 }  # fmt: skip
 
 
-def test_plants_that_share_a_generator_differ_in_what_they_draw():
-    generator, levels = np.random.default_rng(5), set()
+def test_plants_that_share_a_generator_differ_in_their_random_numbers():
+    generator = np.random.default_rng(5)
+    levels = set()
     for _ in range(2):
         env = MiddlePointEnv(setpoint="random")
         env.np_random = generator
@@ -276,9 +277,8 @@ def test_plants_that_share_a_generator_differ_in_what_they_draw():
     assert len(levels) == 2
 
 
-def test_what_a_seed_draws_never_changes():
-    # The third of the seed's streams is the plant's. Which draw a plant number takes is part
-    # of what a seed means.
+def test_plant_numbers_of_a_seed_never_change():
+    # The plant numbers take the random numbers of the seed's third stream, in this order.
     released = (
         "delay", "dead_zone", "u_min", "u_max", "noise_variance", "measurement_noise_variance",
         "disturbance_amplitude", "disturbance_interval", "disturbance_walk_variance",
@@ -286,28 +286,28 @@ def test_what_a_seed_draws_never_changes():
     )  # fmt: skip
     _, info = MiddlePointEnv(**EVERYTHING).reset(seed=7)
     stream = np.random.SeedSequence(7).spawn(4)[2]
-    draws = np.random.Generator(np.random.PCG64(stream)).random(32)
-    assert info["delay"] == 3 + int(23 * draws[0])
-    for name, draw in [*zip(released, draws, strict=False)][1:]:
+    uniform = np.random.Generator(np.random.PCG64(stream)).random(len(released))
+    shares = dict(zip(released, uniform, strict=True))
+    assert info["delay"] == 3 + int(23 * shares.pop("delay"))
+    for name, share in shares.items():
         low, high = EVERYTHING[name]
-        assert info[name] == pytest.approx(low + (high - low) * draw, rel=1e-12), name
+        assert info[name] == pytest.approx(low + (high - low) * share, rel=1e-12), name
 
 
 def test_the_observation_sees_its_noise_and_nothing_else_does(rng):
     actions = rng.uniform(-1, 1, 5_000)
     plant = {"noise_variance": 0.5, "output_window": 1}
-    true = run(MiddlePointEnv(**plant), actions)
-    seen = run(MiddlePointEnv(measurement_noise_variance=0.09, **plant), actions)
+    silent = run(MiddlePointEnv(**plant), actions)
+    noisy = run(MiddlePointEnv(measurement_noise_variance=0.09, **plant), actions)
     for name in ("output", "error", "reward", "noise"):
-        np.testing.assert_array_equal(seen[name], true[name])
-    noise = seen["observation"][:, -1] - seen["output"]
-    assert noise[0] == 0.0  # at rest
+        np.testing.assert_array_equal(noisy[name], silent[name])
+    readings = noisy["observation"][:, -1]
+    noise = readings - noisy["output"]
+    assert noise[0] == 0.0
     assert noise.var() == pytest.approx(0.09, rel=0.1)
-    assert abs(np.corrcoef(noise[1:], seen["noise"][1:])[0, 1]) < 0.06
-    # The error that is shown is that of the reading.
-    np.testing.assert_allclose(
-        seen["observation"][:, 3], seen["setpoint"] - seen["observation"][:, -1], atol=1e-5
-    )
+    assert abs(np.corrcoef(noise[1:], noisy["noise"][1:])[0, 1]) < 0.06
+    observed_errors = noisy["observation"][:, 3]
+    np.testing.assert_allclose(observed_errors, noisy["setpoint"] - readings, atol=1e-5)
 
 
 def test_the_reading_saturates_and_the_truth_does_not():
@@ -318,7 +318,7 @@ def test_the_reading_saturates_and_the_truth_does_not():
 
 
 @pytest.mark.parametrize("slower", [1.0, 2.0])
-def test_with_noise_it_passes_through_the_dynamics_and_its_gain_is_1(slower):
+def test_the_load_passes_through_the_dynamics_and_its_gain_is_1(slower):
     signals = {"disturbance_amplitude": 4.0, "disturbance_walk_variance": 0.01}
     env = MiddlePointEnv(time_constant_factor=slower, noise_variance=0.5, **signals)
     record = run(env, np.zeros(1000))
@@ -341,29 +341,30 @@ def test_drift_ends_at_the_plant_that_factors_give():
     assert record["output"][-1] == pytest.approx(10 * 0.8 * 1.5 * GAIN, rel=1e-9)
 
 
-def test_a_drawn_plant_is_the_plant_with_these_numbers_to_the_bit(rng):
-    drawn_plant = MiddlePointEnv(**EVERYTHING)
+def test_a_sampled_plant_is_the_plant_with_these_numbers_to_the_bit(rng):
+    sampled_plant = MiddlePointEnv(**EVERYTHING)
+    ranges = {name for name, value in EVERYTHING.items() if isinstance(value, list)}
     actions = rng.uniform(-1.2, 1.2, 700)
     for seed in range(5):
-        _, info = drawn_plant.reset(seed=seed)
-        ranges = {name for name, value in EVERYTHING.items() if isinstance(value, list)}
-        assert ranges <= set(info)
-        drawn = {name: info[name] for name in ranges}
-        assert type(drawn["delay"]) is int
-        numbers = {**EVERYTHING, **drawn}
-        ours = run(drawn_plant, actions, seed)
-        theirs = run(MiddlePointEnv(**numbers), actions, seed)
-        assert set(ours) == set(theirs)
-        for name in ours:
-            np.testing.assert_array_equal(ours[name], theirs[name])
+        _, info = sampled_plant.reset(seed=seed)
+        sampled_numbers = {name: info[name] for name in ranges}
+        assert type(info["delay"]) is int
+        fixed_plant = MiddlePointEnv(**EVERYTHING | sampled_numbers)
+        assert_equal_records(run(sampled_plant, actions, seed), run(fixed_plant, actions, seed))
 
 
-def test_draws_come_from_the_seed_and_the_episode_alone():
-    first, second = (MiddlePointEnv(**EVERYTHING) for _ in range(2))
-    before = run(first, np.ones(1500), seed=5)
+def test_random_numbers_depend_on_the_seed_and_the_episode_alone():
+    first = MiddlePointEnv(**EVERYTHING)
+    second = MiddlePointEnv(**EVERYTHING)
+    first_episode = run(first, np.ones(1500), seed=5)
     run(second, -np.ones(2), seed=5)
-    ours, theirs = (run(env, np.zeros(300), seed=None) for env in (first, second))
-    for name in ours:
-        np.testing.assert_array_equal(ours[name], theirs[name])
+    second_episode = run(first, np.zeros(300), seed=None)
+    assert_equal_records(second_episode, run(second, np.zeros(300), seed=None))
     for name in ("noise", "setpoint", "disturbance", "gain_factor"):
-        assert not np.array_equal(before[name][:301], ours[name])
+        assert not np.array_equal(first_episode[name][:301], second_episode[name])
+
+
+def assert_equal_records(record, other):
+    assert set(record) == set(other)
+    for name in record:
+        np.testing.assert_array_equal(record[name], other[name])

@@ -1,4 +1,4 @@
-"""The layout: who imports whom, what an import loads, and the README."""
+"""Check which packages import which, what an import loads, and the pages' examples."""
 
 import ast
 import re
@@ -10,7 +10,7 @@ import pytest
 from tests.conftest import ROOT, python
 
 ALLOWED = {
-    "mptc_gym": {"mptc_gym", "gymnasium", "numpy", "pygame"},  # the last when it is used
+    "mptc_gym": {"mptc_gym", "gymnasium", "numpy", "pygame"},  # pygame within functions
     "agents": {"agents", "numpy"},
 }
 FOLDERS = "mptc_gym", "agents", "benchmarks"
@@ -22,14 +22,14 @@ SOURCES = {
 
 
 def packages(code):
-    """Return which packages are imported, also within functions."""
-    found = set()
+    """Return the packages that some code imports, also within functions."""
+    modules = set()
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            found.add(node.module or "")
-    return {module.partition(".")[0] for module in found}
+            modules.add(node.module or "")
+    return {module.partition(".")[0] for module in modules}
 
 
 @pytest.mark.parametrize("package", ALLOWED)
@@ -42,7 +42,7 @@ def test_layers_import_downwards_only(package):
 
 
 def test_what_is_printed_can_be_redirected_on_windows():
-    # Its encoding of files and pipes has no arrows, and printing one there is an error.
+    # The encoding of files and pipes on Windows has no arrows: printing an arrow is an error.
     for code in SOURCES.values():
         code.encode("cp1252")
 
@@ -59,7 +59,7 @@ EXAMPLES = [
 ]
 
 
-COMPARE = {  # the extra
+COMPARE = {  # the packages of the extra "compare"
     "cyclopts", "filelock", "joblib", "matplotlib", "pandas", "rich", "scipy", "tabulate",
 }  # fmt: skip
 
@@ -67,9 +67,10 @@ COMPARE = {  # the extra
 @pytest.mark.parametrize(("example", "printed"), EXAMPLES, ids=range(len(EXAMPLES)))
 def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, capsys):
     names = packages(example)
-    # `.ci/versions` tests without the extras; then only what needs none of them can run.
-    needed = COMPARE if "benchmarks" in names else set()
-    for name in needed | names - {"agents", "benchmarks"}:
+    # `.ci/versions` tests without the extras, where many examples cannot run.
+    if "benchmarks" in names:
+        names |= COMPARE
+    for name in names - {"agents", "benchmarks"}:
         pytest.importorskip(name, reason=f"the example needs {name}, of an extra")
     monkeypatch.chdir(tmp_path)
     if "minari" in names:
@@ -81,7 +82,7 @@ def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, caps
         for spec in gymnasium.registry.values():
             if spec.id.startswith("MiddlePoint"):
                 monkeypatch.setattr(spec, "max_episode_steps", 30)
-    # A short time will do to see that it runs, where the page does not say what it prints.
+    # An example whose output is not on the page runs for a short time only.
     exec(
         (example if printed else re.sub(r"\d+_000", "1", example))
         .replace("samples=1200", "samples=100, episodes=5")
@@ -89,12 +90,12 @@ def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, caps
         .replace("2048", "64"),
         {},
     )
-    shown = capsys.readouterr().out
-    if printed and ".learn(" in example:  # another processor rounds otherwise
-        scores = [re.search(r"score (\S+);", text)[1] for text in (shown, printed)]
-        assert float(scores[0]) == pytest.approx(float(scores[1]), abs=0.05)
+    output = capsys.readouterr().out
+    if printed and ".learn(" in example:  # the rounding of training depends on the processor
+        scores = [float(re.search(r"score (\S+);", text)[1]) for text in (output, printed)]
+        assert scores[0] == pytest.approx(scores[1], abs=0.05)
     elif printed:
-        assert shown == printed
+        assert output == printed
 
 
 def test_controllers_are_evaluated_without_any_extra():
@@ -106,22 +107,23 @@ import agents, mptc_gym
 print(mptc_gym.evaluate(agents.PIController(), "MiddlePointNoisy-v0").mean_error)
 import mptc_gym.torch_env
 """
-    done = python("-OO", "-c", program)  # and without docstrings
-    # Between the least possible error and that of an idle valve.
-    assert 1.6 < float(done.stdout) < 5.0, done.stderr
-    assert 'pip install "mptc_gym[torch]"' in done.stderr.splitlines()[-1]
+    process = python("-OO", "-c", program)  # the option removes docstrings
+    # The least possible error is 1.6 degC, and the error of an idle valve 5 degC.
+    assert 1.6 < float(process.stdout) < 5.0, process.stderr
+    assert 'pip install "mptc_gym[torch]"' in process.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_what_a_page_links_to_is_there(page):
     targets = re.findall(r"\]\(([^)]*)\)", page.read_text("utf-8"))
     for target in targets:
-        file, _, place = target.partition("#")
-        unknown = target == "ADDRESS"  # the project's own, in the text for Gymnasium's list
-        if unknown or target.startswith("https://"):
+        # "ADDRESS" stands for the project's own address, in the text for Gymnasium's list.
+        if target == "ADDRESS" or target.startswith("https://"):
             continue
-        there = page.parent / file if file else page
-        assert there.exists(), target
-        if place:
-            text = re.sub(r"[^\w\n# -]", "", there.read_text("utf-8")).lower().replace(" ", "-")
-            assert re.search(f"^#+-{place}$", text, re.MULTILINE), target
+        file, _, heading = target.partition("#")
+        linked_page = page.parent / file if file else page
+        assert linked_page.exists(), target
+        if heading:
+            text = re.sub(r"[^\w\n# -]", "", linked_page.read_text("utf-8"))
+            text = text.lower().replace(" ", "-")
+            assert re.search(f"^#+-{heading}$", text, re.MULTILINE), target

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, environments
 from mptc_gym.environments import drawing
 from mptc_gym.environments.record import Record
-from mptc_gym.plant.draws import Ranges
 from mptc_gym.plant.parameters import Parameters
 from tests.conftest import MODES, NOISY, native_and_sync
 
@@ -29,7 +28,7 @@ LEFT, TOP, WIDTH, _ = drawing.FLOWS
 
 def record(*samples, sampling_interval=8.0, **numbers):
     """Return a record of samples (y_d, y, u, u_a) of the paper's plant, or one unlike it."""
-    paper = Ranges(Parameters()).lowest
+    paper = Parameters().lowest
     made = Record(replace(paper, **numbers), sampling_interval, 0.0)
     for sample in samples:
         made.add(*sample)

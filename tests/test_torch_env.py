@@ -18,8 +18,8 @@ from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv  # noqa: E402
-from mptc_gym.plant.draws import Ranges, Streams  # noqa: E402
 from mptc_gym.plant.dynamics import action_from_command, float32_action  # noqa: E402
+from mptc_gym.plant.sampling import PlantSampler, RandomStreams  # noqa: E402
 from mptc_gym.plant.signals import Signals  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv, make_vec  # noqa: E402
 from mptc_gym.wrappers import IncrementalAction  # noqa: E402
@@ -33,17 +33,17 @@ def make(num_envs=2, **arguments):
 def met(envs, seed, *, episodes, samples):
     """Return what the plants of an environment in NumPy meet, to be handed in."""
     parameters, n = envs.parameters, envs.num_envs
-    signals, ranges = Signals.of(parameters, n, samples), Ranges(parameters)
-    streams = [Streams.of_seed(seed + i) for i in range(n)]
+    signals, sampler = Signals.of(parameters, n, samples), PlantSampler(parameters)
+    streams = [RandomStreams.of_seed(seed + i) for i in range(n)]
     found = defaultdict(list)
     for _ in range(episodes):
-        numbers = ranges.draw(streams)
+        numbers = sampler.sample(streams)
         first = {"setpoint": signals.reset(np.arange(n), streams, numbers)}
         for name, signal in signals._asdict().items():
             if signal is not None:
                 rows = [signal.next().copy() for _ in range(samples)]
                 found[name].append([first.get(name, np.zeros(n)), *rows])
-        for name, values in numbers.chosen(parameters.ranges).items():
+        for name, values in numbers.select(parameters.ranges).items():
             found[name].append(values)
     return {name: torch.tensor(np.array(values)) for name, values in found.items()}
 

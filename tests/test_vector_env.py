@@ -67,7 +67,7 @@ def test_it_equals_one_environment_after_the_other(
         seed = rng.integers(0, 2**40, num_envs).tolist()
     moves = [] if compensated == "no wrapper" else [{"compensate_dead_zone": compensated}]
     with (  # so small that many blocks are made and the window is moved back often
-        patch.multiple("mptc_gym.vector_env", BLOCK=7, STEPS_PER_SHIFT=3),
+        patch.multiple("mptc_gym.vector_env", SAMPLES_AT_A_TIME=7, STEPS_PER_SHIFT=3),
         patch.multiple("mptc_gym.plant.signals", PLANTS_AT_A_TIME=2),
     ):
         made = partial(native_and_sync, num_envs, mode, limit, **arguments)

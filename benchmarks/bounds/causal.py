@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from benchmarks.bounds.linear_program import Unknown, equations, response
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import held
-from mptc_gym.plant.signals import Levels
+from mptc_gym.plant.signals import SetPointLevels
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class SetPointLaw:
         at_start = LinearModel(parameters, model.numbers, 0)
         self._flow_response = response(*equations(model, samples))
         self._lag = model.lag
-        levels = Levels(parameters)
+        levels = SetPointLevels(parameters)
         self._amplitude = levels.amplitude
         self._shortest = levels.shortest
         self._longest = levels.longest

@@ -32,8 +32,8 @@ from benchmarks.loop.rollout import (
 )
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
-from mptc_gym.plant.draws import plant_numbers
 from mptc_gym.plant.parameters import PlantNumbers
+from mptc_gym.plant.sampling import plant_numbers
 
 Array = NDArray[np.float64]
 

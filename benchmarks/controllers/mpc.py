@@ -16,7 +16,7 @@ from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL
-from mptc_gym.plant.signals import LOAD_INTERVAL, Levels
+from mptc_gym.plant.signals import LOAD_INTERVAL, SetPointLevels
 
 Array = NDArray[np.float64]
 
@@ -138,7 +138,7 @@ class PredictiveController:
         self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON, dtype=np.intp)
         self._models: dict[int, _Model] = {}  # by the sample from which the coefficients hold
         self._random: RandomSetpoint | None = None
-        levels = Levels(parameters)
+        levels = SetPointLevels(parameters)
         if levels.random:
             self._random = RandomSetpoint(levels.shortest, levels.longest, levels.amplitude)
             self._deviation = self._forecast_deviation()

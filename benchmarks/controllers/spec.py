@@ -11,7 +11,7 @@ from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.linear import LinearLoop, nominal, step_test, time_constant_for
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from mptc_gym import Parameters
-from mptc_gym.plant.signals import Levels
+from mptc_gym.plant.signals import SetPointLevels
 
 LEARNING = 1200  # samples of the square wave in which a controller learns before it is measured
 COMMISSIONING_SEED = SEEDS["preparation"].first  # of the plants and noise of this learning
@@ -86,7 +86,7 @@ def setpoint_holds(plant: Parameters) -> tuple[float, float] | None:
     The result is None if the set point is not random. `plant` has the arguments of the
     environment.
     """
-    levels = Levels(plant)
+    levels = SetPointLevels(plant)
     if not levels.random:
         return None
     return levels.shortest * plant.sampling_interval, levels.longest * plant.sampling_interval

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
-from mptc_gym.plant.draws import Ranges
-from mptc_gym.plant.dynamics import action_from_command, least_effective
+from mptc_gym.plant.dynamics import action_from_command, least_effective_command
 from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.scoring.rollout import rollout as run_batch
 
@@ -100,7 +99,7 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
     seed
         Seed of the first run: the seed of run i is `seed + i`.
     """
-    numbers = Ranges(parameters).lowest.chosen(PLANT_NUMBERS)
+    numbers = parameters.lowest.select(PLANT_NUMBERS)
     if parameters.ranges:
         _, info = make_plants(runs, 1, **asdict(parameters)).reset(seed=seed)
         for name in parameters.ranges:
@@ -250,7 +249,7 @@ def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]
         return {"dead_zone_share": unknown, "saturation_share": unknown}
     u_min, u_max = parameters.u_min, parameters.u_max
     # The smallest magnitude of a command, t/h, that the plant treats as outside the dead zone.
-    edge = least_effective(parameters.dead_zone, u_min, u_max)
+    edge = least_effective_command(parameters.dead_zone, u_min, u_max)
     is_inside = np.abs(command) < edge
     is_at_limit = (command <= u_min) | (command >= u_max)
     return {

@@ -17,11 +17,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mptc_gym.env import INFO, HasPlainSpec, observation_space
+from mptc_gym.env import INFO, HasJsonSpec, observation_space
 from mptc_gym.plant.checks import MOST_PLANTS, count, is_count, reject
 from mptc_gym.plant.dynamics import FACTORS
 from mptc_gym.plant.parameters import Parameters
-from mptc_gym.plant.signals import FOREVER
+from mptc_gym.plant.signals import UNLIMITED
 from mptc_gym.plant.state import PlantState, plant_state
 
 Array = Any  # a NumPy array or a PyTorch tensor, depending on the environment
@@ -29,7 +29,7 @@ Infos = dict[str, Any]
 Mask = NDArray[np.bool_]  # True for the selected plants, shape (num_envs,)
 
 
-class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
+class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
     """n plants that advance together: the part that does not depend on the array library.
 
     The array library is NumPy or PyTorch.
@@ -74,7 +74,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         if not is_count(limit, -1) or limit == 0:
             allowed = "an integer of at least 1, or None or -1 for no limit"
             reject("max_episode_steps", max_episode_steps, allowed)
-        self._limit = FOREVER if limit == -1 else min(FOREVER, int(limit))  # samples
+        self._limit = UNLIMITED if limit == -1 else min(UNLIMITED, int(limit))  # samples
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:

@@ -1,7 +1,7 @@
 """Model the plant: its arguments, its dynamics and the signals that reach it.
 
 - `parameters` declares every argument of the environment, and `checks` checks single values.
-- `draws` draws the plant of an episode, and gives every episode its own random numbers.
+- `sampling` samples the plant numbers of an episode from its own random numbers.
 - `signals` generates set points, noise and loads.
 - `dynamics` steps plants and valves; `state` describes a plant to a teacher in training.
 """

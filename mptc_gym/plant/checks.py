@@ -1,7 +1,7 @@
 """Check single values of arguments and actions.
 
-A check is a function of an argument's name and value. The check returns the value in plain
-Python types, or raises a ValueError that names the argument.
+A check is a function of an argument's name and value. The check returns the value in Python's
+own types, or raises a ValueError that names the argument.
 """
 
 import math
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 # Largest magnitude of an argument. Larger numbers would make float32 observations and squared
 # errors meaningless.
-LARGEST: Final[Any] = 10**9
-# These limits are far above what any plant needs. Without them, a mistyped number could fill
-# the memory.
-LONGEST: Final = 10_000  # samples of a delay or of a window of the observation
+LARGEST_NUMBER: Final[Any] = 10**9
+# The next three limits are far above what any plant needs. Without these limits, a mistyped
+# number could fill the memory.
+LONGEST_DELAY_OR_WINDOW: Final = 10_000  # samples
 MOST_COEFFICIENTS: Final = 1_000  # of one polynomial of the plant
 MOST_PLANTS: Final = 10_000_000  # in one environment, or in one evaluation
 SETPOINTS: Final = ("square", "random")
@@ -27,32 +27,21 @@ _COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # NumPy takes a dtype faster than the type np.float64
 _LONGEST_REPR = 80  # characters of a value in an error message, to keep the message readable
 # The exceptions that NumPy, PyTorch and Python raise for a value that is not a number.
-_NOT_A_NUMBER = AttributeError, TypeError, ValueError, OverflowError, RuntimeError
+NOT_A_NUMBER = AttributeError, TypeError, ValueError, OverflowError, RuntimeError
 
 Number = float | Sequence[float]  # a number, or a range [low, high]
 Check = Callable[[str, Any], Any]  # takes the name of an argument and its value
 
 
 def reject(name: str, value: object, allowed: str) -> NoReturn:
-    """Raise a ValueError that says that an argument's value is not allowed.
-
-    Parameters
-    ----------
-    name
-        Name of the argument.
-    value
-        The value that is not allowed; the message shows at most 80 characters of the value.
-    allowed
-        What is allowed, as in "a number above 0", to follow "must be".
-    """
+    """Raise a ValueError with the message "`name` must be `allowed`, got `value`"."""
     raise ValueError(f"{name} must be {allowed}, got {shorten(value)}") from None
 
 
 def shorten(value: object) -> str:
-    """Return the repr of a value for a message, or of a long repr the first 80 characters.
+    """Return the repr of a value, for a message, cut to its first 80 characters.
 
-    The number of elements of a long list, and the shape of a long array, follow the shortened
-    repr.
+    If the repr is cut, the length of a list or the shape of an array follows.
     """
     text = repr(value)
     length = ""
@@ -81,9 +70,8 @@ def one_action(action: Any) -> float:
     """
     try:
         array = action if hasattr(action, "item") else np.asarray(action)
-        # Subtracting 0.0 fails for text: text is not a number, even if float() can parse it.
-        checked = float(array.item() - 0.0)
-    except _NOT_A_NUMBER:
+        checked = float(array.item() - 0.0)  # subtracting 0.0 fails for text such as "0.3"
+    except NOT_A_NUMBER:
         checked = math.nan
     if not math.isfinite(checked):
         reject("action", action, "one finite number, shape (1,)")
@@ -93,7 +81,7 @@ def one_action(action: Any) -> float:
 def many_actions(
     actions: Any, num_envs: int, ignored: NDArray[np.bool_] | None
 ) -> NDArray[np.float64]:
-    """Return the actions of many plants in a new array.
+    """Return the actions of many plants in a new array, shape (num_envs,).
 
     Parameters
     ----------
@@ -102,23 +90,18 @@ def many_actions(
     num_envs
         Number of plants.
     ignored
-        True for each plant whose action is ignored, shape (num_envs,): the result for such a
-        plant is 0, and the action need not be finite. None if no action is ignored.
-
-    Returns
-    -------
-    ndarray of float64
-        The actions, shape (num_envs,).
+        True for each plant whose action is ignored, shape (num_envs,): an ignored action may be
+        infinite or NaN, and becomes 0. None if no action is ignored.
 
     Raises
     ------
     ValueError
-        If the actions have another shape, or if an action that counts is not a finite number.
+        If `actions` has another shape, or if an action is not a finite number.
     """
-    columns = _as_float64(actions)
-    if columns is None or columns.shape != (num_envs, 1):
+    array = _as_float64(actions)
+    if array is None or array.shape != (num_envs, 1):
         reject("actions", actions, f"numbers, shape ({num_envs}, 1)")
-    checked = columns.ravel()
+    checked = array.ravel()
     if ignored is not None:
         checked[ignored] = 0.0
     # The sum of squares, which is fast, is finite if all actions are finite and none is huge.
@@ -128,55 +111,45 @@ def many_actions(
 
 
 def _as_float64(values: Any) -> NDArray[np.float64] | None:
-    """Return an array, list or tensor in a new float64 array; None if not all are numbers."""
+    """Return an array, list or tensor as a new float64 array; None if not all are numbers."""
     try:
         array = np.asarray(values)
         if array.dtype.hasobject:
-            array = np.array((array - 0.0).tolist())
-        # This cast fails for text: text is not a number, even if NumPy can parse the text.
-        return array.astype(_FLOAT64, casting="same_kind")
-    except _NOT_A_NUMBER:
+            array = np.array((array - 0.0).tolist())  # subtracting 0.0 fails for text
+        return array.astype(_FLOAT64, casting="same_kind")  # a cast that fails for text
+    except NOT_A_NUMBER:
         return None
 
 
-def plain(value: Any) -> Any:
-    """Return a value with lists for arrays and Python numbers for NumPy's, also in lists."""
+def to_python(value: Any) -> Any:
+    """Return a value, or a list or tuple of values, without the types of NumPy.
+
+    An array becomes a list, and a NumPy number becomes a Python number.
+    """
     if isinstance(value, list | tuple):
-        return type(value)(map(plain, value))
+        return type(value)(map(to_python, value))
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return value
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a real number, but no bool, of magnitude `LARGEST` (1e9) at most."""
+    """Return whether a value is a real number from -1e9 to 1e9, and not a bool."""
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
-    return bool(-LARGEST <= value <= LARGEST)
+    return bool(-LARGEST_NUMBER <= value <= LARGEST_NUMBER)
 
 
 def is_count(value: Any, minimum: int = 0) -> bool:
-    """Whether a value is an integer, but no bool, of at least `minimum`."""
+    """Return whether a value is an integer of at least `minimum`, and not a bool."""
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
 
 
-def number(name: str, value: Any, low: float = -LARGEST, allowed: str | None = None) -> float:
-    """Return the value of an argument as a float, 0.0 for -0.0; ValueError if not allowed.
-
-    Parameters
-    ----------
-    name
-        Name of the argument, for the message.
-    value
-        A value that must be a number from `low` to `LARGEST` (1e9).
-    low
-        Smallest number that is allowed.
-    allowed
-        What the message says is allowed; None for "a number from `low` to 1e9".
-    """
+def number(name: str, value: Any, low: float = -LARGEST_NUMBER) -> float:
+    """Return the value of an argument as a float; ValueError unless it is from `low` to 1e9."""
     if not is_number(value) or value < low:
-        reject(name, value, allowed or f"a number from {low:g} to {LARGEST:g}")
-    return float(value) + 0.0
+        reject(name, value, f"a number from {low:g} to {LARGEST_NUMBER:g}")
+    return float(value) + 0.0  # which turns -0.0 into 0.0
 
 
 not_negative = partial(number, low=0.0)
@@ -185,46 +158,26 @@ at_least_1 = partial(number, low=1.0)
 
 
 def count(name: str, value: Any, minimum: int, maximum: int) -> int:
-    """Return the value of an argument as an int; ValueError unless in the allowed range.
+    """Return the value of an argument as an int; ValueError unless `value` is an integer.
 
-    Parameters
-    ----------
-    name
-        Name of the argument, for the message.
-    value
-        A value that must be an integer, but no bool.
-    minimum, maximum
-        The allowed range, both ends included.
+    The integer must lie between `minimum` and `maximum`, both included.
     """
     if not is_count(value, minimum) or value > maximum:
         reject(name, value, f"an integer from {minimum} to {maximum:,}")
     return int(value)
 
 
-samples = partial(count, minimum=0, maximum=LONGEST)  # a delay or the size of a window
-duration = partial(count, minimum=1, maximum=LARGEST)  # a duration in samples
+samples = partial(count, minimum=0, maximum=LONGEST_DELAY_OR_WINDOW)
+duration = partial(count, minimum=1, maximum=LARGEST_NUMBER)  # in samples
 
 
 def numbers(
     name: str, value: Any, allowed: str = _COEFFICIENTS, most: float = MOST_COEFFICIENTS
 ) -> tuple[float, ...]:
-    """Return a list of numbers, the value of an argument, as a tuple of floats.
+    """Return an argument's value, a list or tuple of 1 to `most` numbers, as a tuple of floats.
 
-    Parameters
-    ----------
-    name
-        Name of the argument, for the message.
-    value
-        A value that must be a list or a tuple of 1 to `most` numbers within +-1e9.
-    allowed
-        What the message says is allowed.
-    most
-        Largest number of elements that is allowed.
-
-    Raises
-    ------
-    ValueError
-        If the value is not such a list.
+    A ValueError that says what is `allowed` is raised for any other value, and if a number is
+    not within +-1e9.
     """
     if not isinstance(value, list | tuple) or not 0 < len(value) <= most:
         reject(name, value, allowed)
@@ -238,22 +191,16 @@ def numbers(
 
 
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
-    """Return the coefficients of a polynomial as floats; ValueError unless the first is 1.
-
-    `name` is the argument's name, for the message, and `value` the list of coefficients.
-    """
+    """Return the coefficients of a polynomial as floats; ValueError unless the first is 1."""
     allowed = f"{_COEFFICIENTS}, the first of them 1"
-    checked = numbers(name, value, allowed)
-    if checked[0] != 1.0:
+    coefficients = numbers(name, value, allowed)
+    if coefficients[0] != 1.0:
         reject(name, value, allowed)
-    return checked
+    return coefficients
 
 
 def one_of(name: str, value: Any, choices: Sequence[str | None]) -> Any:
-    """Return the value of an argument if `choices` contains the value; otherwise ValueError.
-
-    `name` is the argument's name, for the message. The choices are texts or None.
-    """
+    """Return the value of an argument; ValueError unless `value` is one of `choices`."""
     if not isinstance(value, str | None) or value not in choices:
         reject(name, value, " or ".join(map(repr, choices)))
     return value
@@ -263,30 +210,26 @@ reward = partial(one_of, choices=REWARDS)
 
 
 def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
-    """Return the set point argument: one of `SETPOINTS`, a float, or a tuple of floats, degC.
+    """Return the argument `setpoint`: one of `SETPOINTS`, a float, or a tuple of floats.
 
-    A float is a constant set point, and a tuple holds a set point for each sample. For any
-    other value, a ValueError that names the argument `name` is raised.
+    A float is a constant set point, degC, and a tuple holds a set point for each sample, degC.
+    A ValueError is raised for any other value.
     """
     allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
     if isinstance(value, list | tuple):
-        return numbers(name, value, allowed, math.inf)
+        return numbers(name, value, allowed, most=math.inf)
     if isinstance(value, str) and value in SETPOINTS:
         return value
-    return number(name, value, allowed=allowed)
+    if not is_number(value):
+        reject(name, value, allowed)
+    return number(name, value)
 
 
-def or_range(check: Callable[[str, Any], float], name: str, value: Any) -> Number:
-    """Return a number that passes `check`, or a range (low, high) of two such numbers.
+def number_or_range(check: Callable[[str, Any], float], name: str, value: Any) -> Number:
+    """Return the value of an argument: one number, or a range (low, high) of two numbers.
 
-    Parameters
-    ----------
-    check
-        Check of a single number.
-    name
-        Name of the argument, for the message of a ValueError.
-    value
-        A number, or a list or tuple of two numbers: the ends of the range.
+    `check` checks a single number. A ValueError is raised if a number does not pass `check`, or
+    if `value` is a list or tuple that is not a range.
     """
     if not isinstance(value, list | tuple):
         return check(name, value)

@@ -1,4 +1,4 @@
-"""Step the plant and its actuator: arithmetic on state, input and parameters, nothing else.
+"""Step the plant and its actuator, without set point, reward and Gymnasium.
 
 There are two implementations: `Plant` in Python floats, which is fastest for one plant, and
 `PlantBatch` in NumPy arrays for many plants. Both classes do the same operations in the same
@@ -13,8 +13,7 @@ with temperature y, commanded flow u, applied flow u_a, delay d in samples and w
 """
 
 from collections import deque
-from itertools import accumulate, pairwise
-from operator import mul
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -23,6 +22,9 @@ from numpy.typing import NDArray
 from mptc_gym.plant.parameters import Parameters, PlantNumbers, slowest_pole
 
 Values = NDArray[np.float64]  # one element per plant, shape (n,)
+# In NumPy arithmetic, an array of one element is faster than a Python number.
+_ZERO = np.array(0.0)
+_ONE = np.array(1.0)
 # Samples between two changes of drifting dynamics: drifts are slow, and a change takes time.
 DRIFT_INTERVAL: Final = 10
 FACTORS: Final = "gain_factor", "time_constant_factor"  # keys of the drift factors in infos
@@ -31,17 +33,19 @@ FACTORS: Final = "gain_factor", "time_constant_factor"  # keys of the drift fact
 def action_from_command(command: Any, u_min: Any, u_max: Any) -> Any:
     """Return the normalised action, -1 at `u_min` and 1 at `u_max`, for a flow command in t/h.
 
-    The arguments are floats, or arrays or tensors that broadcast, and so is the result.
-    Commands beyond the limits give actions beyond -1 or 1.
+    The arguments and the result are floats, or arrays or tensors that broadcast. A command
+    beyond the limits gives an action beyond -1 or 1.
     """
     return 2.0 * (command - u_min) / (u_max - u_min) - 1.0
 
 
-def least_effective(dead_zone: Any, u_min: Any, u_max: Any, rounding: float = 2.0**-50) -> Any:
+def least_effective_command(
+    dead_zone: Any, u_min: Any, u_max: Any, rounding: float = 2.0**-50
+) -> Any:
     """Return the smallest magnitude of a flow command that passes the dead zone, in t/h.
 
-    The result lies a few roundings below `dead_zone`: a command on the edge of the dead zone
-    has an effect, also after the command was scaled to an action and back.
+    The result is a few rounding errors smaller than `dead_zone`, so that a command on the edge
+    of the dead zone still has an effect after it was scaled to an action and back.
 
     Parameters
     ----------
@@ -66,7 +70,7 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     Parameters
     ----------
     command
-        Flows to be commanded, t/h, of any shape.
+        Commanded flows, t/h, of any shape.
     u_min, u_max
         Limits of the actuator, t/h.
     dead_zone
@@ -81,11 +85,12 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     actions = np.asarray(action_from_command(commands, u_min, u_max)).astype(np.float32)
     half_range = (u_max - u_min) / 2.0
     # The commands that the plant computes from the rounded actions, t/h.
-    rounded = (actions.astype(float) + 1.0) * half_range + u_min
-    lost_its_effect = (np.abs(commands) >= dead_zone) & ~(np.abs(rounded) >= dead_zone)
+    rounded_commands = (actions.astype(float) + 1.0) * half_range + u_min
+    had_effect = np.abs(commands) >= dead_zone
+    has_effect = np.abs(rounded_commands) >= dead_zone
     spacing = np.spacing(np.maximum(np.abs(actions), np.float32(1.0)))
-    outwards = actions + np.copysign(spacing, commands).astype(np.float32)
-    return np.where(lost_its_effect, outwards, actions)
+    moved_actions = actions + np.copysign(spacing, commands).astype(np.float32)
+    return np.where(had_effect & ~has_effect, moved_actions, actions)
 
 
 class Dynamics:
@@ -95,37 +100,38 @@ class Dynamics:
     with temperature y, applied flow u_a, delay d and white noise xi. The polynomial A is (1 - p
     z^-1) Q, where p is the slowest pole. Two factors, g and t, change the plant: the
     steady-state gain is g B(1) / A(1), and the time constant is t / (1 - p) samples. The time
-    constant is the area above the step response of 1 / (1 - p z^-1), scaled to end at 1. For t
-    times the time constant, the number 1 - p is divided by t, and the polynomial Q stays. As
-    A(1) = (1 - p) Q(1) is also divided by t, the polynomial B is multiplied by g / t.
+    constant is the area above the step response of 1 / (1 - p z^-1), scaled to end at 1. To
+    multiply the time constant by t, the slowest pole p moves so that 1 - p is divided by t; the
+    polynomial Q, which holds the other poles, stays. As A(1) = (1 - p) Q(1) is then divided by
+    t, the polynomial B is multiplied by g / t.
 
     Parameters
     ----------
     parameters
-        The arguments of the plant, which hold the coefficients of A and B.
+        The arguments of the environment.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._drift_samples = parameters.drift_samples
-        self._alpha = tuple(-coefficient for coefficient in parameters.a[1:])
+        self._negated_a = [-coefficient for coefficient in parameters.a[1:]]
         self._sum_of_a = sum(parameters.a)  # A(1)
-        # The coefficients of Q from z^0 on, and a 0; None if the time constant never changes.
-        self._quotient: tuple[float, ...] | None = None
+        # The coefficients of Q from z^0 on, and a 0; empty if the time constant never changes.
+        self._quotient: list[float] = []
         if parameters.changes_time_constant:
             pole = slowest_pole(parameters.a).real  # a real one, as Parameters has checked
             self._rate = 1.0 - pole
-            # A / (1 - p z^-1) by Horner's scheme.
-            quotient = accumulate(
-                parameters.a[:-1], lambda previous, coefficient: coefficient + pole * previous
-            )
-            self._quotient = (*quotient, 0.0)
+            quotient = 0.0
+            for coefficient in parameters.a[:-1]:  # A / (1 - p z^-1) by Horner's scheme
+                quotient = coefficient + pole * quotient
+                self._quotient.append(quotient)
+            self._quotient.append(0.0)
 
-    def share(self, age: Any) -> Any:
-        """Return the share of gain and time constant drift that is complete at k = `age`.
+    def drift_share(self, age: Any) -> Any:
+        """Return which share of the drifts of gain and time constant is complete at k = `age`.
 
-        The share grows linearly from 0 at sample k = 0 to 1 at sample k = `drift_samples`, and
-        stays 1 from this sample on. `age` is a number, or an array or a tensor with an element
-        for each plant.
+        The share of a drift that is complete grows linearly from 0 at sample k = 0 to 1 at
+        sample k = `drift_samples`, and then stays 1. `age` and the result are numbers, or
+        arrays or tensors with an element for each plant.
         """
         share = age / self._drift_samples
         return share * (share < 1.0) + (share >= 1.0)  # at most 1, for arrays of any library
@@ -133,20 +139,17 @@ class Dynamics:
     def factors(self, numbers: PlantNumbers[Any], age: Any) -> tuple[Any, Any]:
         """Return the gain factor g and the time constant factor t at sample k = `age`.
 
+        g and t are multiples of the gain and of the time constant that the arguments `a` and
+        `b` give: two floats, or two arrays or tensors of shape (n,) for n plants.
+
         Parameters
         ----------
         numbers
             The plant numbers, which hold the factors at k = 0 and the drifts.
         age
             Samples since the start of the episode: a number, or one element for each plant.
-
-        Returns
-        -------
-        tuple
-            g and t, as multiples of the gain and the time constant of A and B of equation (28)
-            of the paper: two floats, or two arrays or tensors of shape (n,) for n plants.
         """
-        share = self.share(age)
+        share = self.drift_share(age)
         gain = numbers.gain_factor
         time_constant = numbers.time_constant_factor
         return (
@@ -160,8 +163,8 @@ class Dynamics:
         Parameters
         ----------
         gain, time_constant
-            g and t, as multiples of the gain and the time constant of the polynomials A and B:
-            floats, or arrays or tensors of shape (n,) for n plants.
+            g and t, as multiples of the gain and of the time constant of the polynomials A and
+            B: floats, or arrays or tensors of shape (n,) for n plants.
 
         Returns
         -------
@@ -171,13 +174,13 @@ class Dynamics:
         scale : float or array
             Factor g / t of the polynomial B.
         load_gain : float or array
-            A(1) after the change of the time constant: the factor of the load w(k), by which a
-            constant load w adds w to the steady-state temperature.
+            A(1) after the change of the time constant: the factor of the load w(k), with which
+            a constant load w adds w to the steady-state temperature.
         """
-        alpha: list[Any] = list(self._alpha)
-        if self._quotient is not None:
-            pole = 1.0 - self._rate / time_constant
+        alpha: list[Any] = self._negated_a
+        if self._quotient:
             # The coefficients of -(1 - p z^-1) Q, with p = `pole`, from z^-1 on.
+            pole = 1.0 - self._rate / time_constant
             alpha = [
                 pole * previous - following for previous, following in pairwise(self._quotient)
             ]
@@ -189,8 +192,7 @@ class Plant:
 
     As printed in the paper, equation (29) compares the magnitude of the command u with U_min in
     one of its cases. The intended meaning is: a command inside the dead zone has no effect, and
-    any other command, also a command on the edge of the dead zone, is limited to [U_min,
-    U_max].
+    a command on the edge of the dead zone or outside is limited to [U_min, U_max].
 
     Parameters
     ----------
@@ -202,28 +204,29 @@ class Plant:
     Attributes
     ----------
     factors : dict of float
-        If gain and time constant drift, the present gain factor and time constant factor, under
-        the names `FACTORS`, as multiples of the gain and the time constant of the polynomials A
-        and B. Empty if neither drifts.
+        If gain and time constant drift, the present factors "gain_factor" and
+        "time_constant_factor", as multiples of the gain and of the time constant of the
+        polynomials A and B. Empty if neither drifts.
     """
 
     def __init__(self, parameters: Parameters, numbers: PlantNumbers[float]) -> None:
-        u_min, u_max = numbers.u_min, numbers.u_max
-        edge = least_effective(numbers.dead_zone, u_min, u_max)
-        self._actuator = edge, u_min, u_max, (u_max - u_min) / 2.0
         self._numbers = numbers
+        self._u_min = numbers.u_min
+        self._u_max = numbers.u_max
+        self._half_range = (numbers.u_max - numbers.u_min) / 2.0
+        self._edge = least_effective_command(numbers.dead_zone, numbers.u_min, numbers.u_max)
         self._drifts = parameters.drifts
         self.factors: dict[str, float] = {}
         self._age = 0
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()
-        # A coefficient of B is paired with the index of its flow in `_inputs`. The histories of
-        # temperatures y and flows u_a have the newest sample first: y(k), y(k-1), ... and
-        # u_a(k), u_a(k-1), ...
+        # Past temperatures and applied flows, the newest first.
         delay = int(numbers.delay)
+        past_flows = delay + len(parameters.b)
+        self._outputs = deque([0.0] * len(self._alpha), maxlen=len(self._alpha))
+        self._flows = deque([0.0] * past_flows, maxlen=past_flows)
+        # Each coefficient of B with the index of its flow in `_flows`.
         self._beta = tuple(enumerate(parameters.b, start=delay))
-        self._outputs = deque([0.0] * len(self._alpha), len(self._alpha))
-        self._inputs = deque([0.0] * (delay + len(self._beta)), delay + len(self._beta))
 
     def step(self, action: float, noise: float, load: float) -> tuple[float, float, float]:
         """Move the plant from sample k to sample k+1.
@@ -246,24 +249,24 @@ class Plant:
             self._age += 1
             if self._age % DRIFT_INTERVAL == 0:
                 self._update_dynamics()
-        edge, u_min, u_max, half_range = self._actuator
         # Last formula of the paper's Section 4, which scales network outputs from 0 to 1, for
         # actions from -1 to 1.
-        command = u_min + (action + 1.0) * half_range
+        u_min = self._u_min
+        command = u_min + (action + 1.0) * self._half_range
         # Equation (29): dead zone and limits.
         applied = command
-        if -edge < command < edge:
+        if -self._edge < command < self._edge:
             applied = 0.0
         elif command < u_min:
             applied = u_min
-        elif command > u_max:
-            applied = u_max
+        elif command > self._u_max:
+            applied = self._u_max
         # Equation (28): the sum of B times past flows, the load, and A times past temperatures.
-        inputs = self._inputs
-        inputs.appendleft(applied)
+        flows = self._flows
+        flows.appendleft(applied)
         response = 0.0
         for lag, beta in self._beta:
-            response += beta * inputs[lag]
+            response += beta * flows[lag]
         if load:
             noise += self._load_gain * load
         output = noise + self._scale * response
@@ -279,6 +282,7 @@ class Plant:
         if self._drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
+        # Each factor of a past temperature, with the index of the temperature in `_outputs`.
         self._alpha = tuple(enumerate(alpha))
 
 
@@ -295,18 +299,17 @@ class PlantBatch:
     Attributes
     ----------
     numbers : PlantNumbers
-        The plant numbers of the present episodes, in arrays of float64. Numbers that resets
-        draw have the shape (n,), and the other numbers the shape ().
+        The plant numbers of the present episodes, in arrays of float64: of shape (n,) for the
+        arguments that are ranges, and of shape () for the other arguments.
     factors : dict of ndarray of float64
-        If gain and time constant drift, the present gain factor and time constant factor, under
-        the names `FACTORS`, shape (n,), as multiples of the gain and the time constant of the
-        polynomials A and B of equation (28) of the paper. Empty if neither drifts.
+        If gain and time constant drift, the present factors "gain_factor" and
+        "time_constant_factor", shape (n,), as multiples of the gain and of the time constant of
+        the polynomials A and B of equation (28) of the paper. Empty if neither drifts.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         self._parameters = parameters
         self._num_envs = num_envs
-        # In NumPy arithmetic, an array of one element is faster than a Python number.
         numbers: dict[str, Values] = {}
         for name, lowest in vars(parameters.lowest).items():
             shape = (num_envs,) if name in parameters.ranges else ()
@@ -315,44 +318,42 @@ class PlantBatch:
         self._update_actuator()
 
         self._dynamics = Dynamics(parameters)
-        # Samples since the plants were created, and at the start of each plant's episode.
+        # Times of the drifts, in samples since the plants were created: the present time, the
+        # start of each plant's episode, and when the dynamics of some plant change next.
         self._clock = 0
-        self._starts = np.zeros(num_envs if parameters.drifts else (), np.int64)
-        self._next_update = 0  # the clock when the dynamics of some plant change next
+        self._starts = np.zeros((), np.int64)
+        if parameters.drifts:
+            self._starts = np.zeros(num_envs, np.int64)
+        self._next_update = 0
         self.factors: dict[str, Values] = {}
         self._update_dynamics()
         order = len(self._alpha)
         self._outputs = deque(np.zeros((order, num_envs)), maxlen=order)  # newest first
         self._input_response = _InputResponse(parameters, num_envs)
 
-    def reset(self, which: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
-        """Bring some plants to rest and replace their plant numbers.
+    def reset(self, plants: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
+        """Bring the plants with the indices `plants` to rest, and set their plant numbers.
 
-        Parameters
-        ----------
-        which
-            The indices of the plants.
-        numbers
-            The new plant numbers: numbers that resets draw have the shape (len(which),), and
-            the other numbers the shape ().
+        `numbers` holds arrays of shape (len(plants),) for the arguments that are ranges, and of
+        shape () for the other arguments.
         """
         for outputs in self._outputs:
-            outputs[which] = 0.0
-        self._input_response.reset(which, numbers.delay)
+            outputs[plants] = 0.0
+        self._input_response.reset(plants, numbers.delay)
         ranges = self._parameters.ranges
-        for name, values in numbers.chosen(ranges).items():
-            getattr(self.numbers, name)[which] = values
+        for name, values in numbers.select(ranges).items():
+            getattr(self.numbers, name)[plants] = values
         if ranges:
             self._update_actuator()
         if self._parameters.drifts:
-            self._starts[which] = self._clock
+            self._starts[plants] = self._clock
         if ranges or self._parameters.drifts:
             self._update_dynamics()
 
     def step(
         self, action: Values, noise: Values, load: Values | None = None
     ) -> tuple[Values, Values, Values]:
-        """Move all plants from sample k to sample k+1. All arrays have the shape (n,).
+        """Move all plants from sample k to sample k+1; all arrays have the shape (n,).
 
         Parameters
         ----------
@@ -367,23 +368,22 @@ class PlantBatch:
         -------
         tuple of ndarray
             Commanded flows u(k) and applied flows u_a(k), t/h, and temperatures y(k+1), degC.
-            The caller must not modify the array of temperatures, which the plants keep.
+            The caller must not modify the array of temperatures.
         """
         if self._parameters.drifts:
             self._clock += 1
             if self._clock >= self._next_update:
                 self._update_dynamics()
-        zero, one, half_range, lowest, edge, u_min, u_max = self._actuator
-        command = action + one
-        command *= half_range
-        command += lowest
+        command = action + _ONE
+        command *= self._half_range
+        command += self.numbers.u_min
         # Equation (29): limits and dead zone.
-        applied = np.minimum(command, u_max)
-        np.maximum(applied, u_min, out=applied)
+        applied = np.minimum(command, self._u_max)
+        np.maximum(applied, self._u_min, out=applied)
         # A product is faster than a mask, whose branches are unpredictable. The product can be
         # -0, which adding 0 turns into 0.
-        applied *= np.abs(command) >= edge
-        applied += zero
+        applied *= np.abs(command) >= self._edge
+        applied += _ZERO
         # Equation (28): the sum of B times past flows, the load, and A times past temperatures.
         response = self._input_response.add(applied)
         if self._parameters.changes_dynamics:
@@ -391,42 +391,34 @@ class PlantBatch:
         if load is not None:
             noise = noise + self._load_gain * load
         output: Values = noise + response
-        for term in map(mul, self._alpha, self._outputs):
-            output += term
+        for alpha, past_output in zip(self._alpha, self._outputs, strict=True):
+            output += alpha * past_output
         self._outputs.appendleft(output)
         return command, applied, output
 
     def _update_actuator(self) -> None:
-        """Compute the arrays that `step` needs from limits and dead zones, after these change.
-
-        The limits are stored with the shape (num_envs,): in comparisons, an array of full
-        length is faster than an array of one number.
-        """
+        """Compute what `step` needs from limits and dead zones, after these change."""
         u_min = self.numbers.u_min
         u_max = self.numbers.u_max
-        self._actuator = (
-            np.array(0.0),
-            np.array(1.0),
-            np.array((u_max - u_min) / 2.0),
-            np.array(u_min),
-            np.array(least_effective(self.numbers.dead_zone, u_min, u_max)),
-            np.full(self._num_envs, u_min),
-            np.full(self._num_envs, u_max),
-        )
+        self._half_range = np.array((u_max - u_min) / 2.0)
+        self._edge = np.array(least_effective_command(self.numbers.dead_zone, u_min, u_max))
+        # In comparisons, an array of shape (n,) is faster than an array of one number.
+        self._u_min = np.full(self._num_envs, u_min)
+        self._u_max = np.full(self._num_envs, u_max)
 
     def _update_dynamics(self) -> None:
         """Compute coefficients and drift factors for the present sample k of each plant.
 
-        The dynamics of a plant change only at samples that are multiples of `DRIFT_INTERVAL`.
+        Dynamics that drift change only at samples k that are multiples of `DRIFT_INTERVAL`.
         """
-        ages = self._clock - self._starts
-        last_changes = ages // DRIFT_INTERVAL * DRIFT_INTERVAL
-        factors = self._dynamics.factors(self.numbers, last_changes)
+        ages = self._clock - self._starts  # the present sample k of each plant's episode
+        ages_at_change = ages // DRIFT_INTERVAL * DRIFT_INTERVAL  # at the latest change
+        factors = self._dynamics.factors(self.numbers, ages_at_change)
         if self._parameters.drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
         self._alpha = tuple(map(np.asarray, alpha))
-        samples_to_change = last_changes + DRIFT_INTERVAL - ages
+        samples_to_change = ages_at_change + DRIFT_INTERVAL - ages
         self._next_update = self._clock + int(samples_to_change.min())
 
 
@@ -434,9 +426,9 @@ class _InputResponse:
     """The part of the temperature that past flows cause, B(z^-1) u_a(k-d), for many plants.
 
     B is the polynomial of equation (28) of the paper, u_a the applied flow and d the delay, in
-    samples. With d the shortest delay that can be drawn, the flows of d + 1 samples affect no
-    temperature before the last of these flows is known. The effect of such a block of d + 1
-    flows is therefore computed when the block is complete, and then read sample by sample.
+    samples. A flow affects no temperature of the next d samples, where d is the shortest
+    possible delay. The effect of a block of d + 1 flows is therefore computed at once, when the
+    block is complete, and then read sample by sample.
 
     The flows lie in rows, one row per sample, the oldest sample first: the older flows that B
     and longer delays also need, and then the flows of the block.
@@ -453,60 +445,55 @@ class _InputResponse:
         self._num_envs = num_envs
         self._beta = tuple(parameters.b)
         shortest, self._longest = map(int, parameters.range_of("delay"))
-        self._block = shortest + 1  # samples in a block
-        # Samples before the block whose flows B and longer delays need.
-        self._older = len(self._beta) - 1 + self._longest - shortest
-        self._inputs = np.zeros((self._older + self._block, num_envs))
-        self._response = np.zeros((self._block, num_envs))
+        self._block_rows = shortest + 1
+        # Rows before the block, with the older flows that B and longer delays need.
+        self._older_rows = len(self._beta) - 1 + self._longest - shortest
+        self._flows = np.zeros((self._older_rows + self._block_rows, num_envs))
+        self._response = np.zeros((self._block_rows, num_envs))
         # Index of the next flow in the block. The first flow completes a block, whose other
         # flows, before k = 0, are 0.
-        self._place = self._block - 1
-        # If the delays differ: the flows in `_inputs` that act on the block after the delay of
-        # each plant, and the indices of these flows in the flattened `_inputs`.
+        self._next_row = self._block_rows - 1
+        # Used only if the delays differ: the flows in `_flows` that act on the block after the
+        # delay of each plant, and the indices of these flows in the flattened `_flows`.
         self._delays_differ = self._longest > shortest
-        rows = len(self._beta) - 1 + self._block if self._delays_differ else 0
-        self._delayed = np.zeros((rows, num_envs))
-        self._delayed_at = np.zeros((rows, num_envs), np.intp)
+        delayed_rows = len(self._beta) - 1 + self._block_rows
+        self._delayed_flows = np.zeros((delayed_rows, num_envs))
+        self._delayed_indices = np.zeros((delayed_rows, num_envs), np.intp)
 
-    def reset(self, which: NDArray[np.intp], delays: Values) -> None:
-        """Begin an episode of some plants, whose flows before the episode count as 0.
+    def reset(self, plants: NDArray[np.intp], delays: Values) -> None:
+        """Begin an episode of the plants with the indices `plants`; past flows count as 0.
 
-        Parameters
-        ----------
-        which
-            The indices of the plants.
-        delays
-            Delays of these plants, samples, shape (len(which),) if delays are drawn, otherwise
-            shape ().
+        `delays` holds the delays of these plants, samples, shape (len(plants),) or ().
         """
-        self._inputs[:, which] = 0.0
-        self._response[:, which] = 0.0
+        self._flows[:, plants] = 0.0
+        self._response[:, plants] = 0.0
         if self._delays_differ:
             first_rows = self._longest - delays.astype(np.intp)
-            rows = np.arange(len(self._delayed))[:, np.newaxis] + first_rows
-            self._delayed_at[:, which] = rows * self._num_envs + which
+            rows = np.arange(len(self._delayed_flows))[:, np.newaxis] + first_rows
+            self._delayed_indices[:, plants] = rows * self._num_envs + plants
 
     def add(self, applied: Values) -> Values:
-        """Add the applied flows of sample k and return their effect on the next temperatures.
+        """Add the applied flows of sample k, and return the effect of flows on y(k+1).
 
-        `applied` is u_a(k), t/h, shape (n,). The result is B(z^-1) u_a(k+1-d), a part of
-        y(k+1), degC, shape (n,); the caller must not modify the result.
+        `applied` holds the flows u_a(k), t/h, shape (n,). The result is B(z^-1) u_a(k+1-d), a
+        part of y(k+1), degC, shape (n,); the caller must not modify the result.
         """
-        self._inputs[self._older + self._place] = applied
-        self._place += 1
-        if self._place == self._block:
+        self._flows[self._older_rows + self._next_row] = applied
+        self._next_row += 1
+        if self._next_row == self._block_rows:
             self._respond()
-            self._place = 0
-        response: Values = self._response[self._place]
+            self._next_row = 0
+        response: Values = self._response[self._next_row]
         return response
 
     def _respond(self) -> None:
         """Compute the effect of a complete block of flows, and make room for the next block."""
-        inputs = self._inputs
+        flows = self._flows
         if self._delays_differ:
-            inputs = inputs.take(self._delayed_at, out=self._delayed, mode="clip")
+            # "clip" is faster than a check of the indices, which are always valid.
+            flows = flows.take(self._delayed_indices, out=self._delayed_flows, mode="clip")
         self._response[:] = 0.0
         for lag, beta in enumerate(self._beta):
-            first = len(self._beta) - 1 - lag
-            self._response += beta * inputs[first : first + self._block]
-        self._inputs[: self._older] = self._inputs[self._block :]
+            first_row = len(self._beta) - 1 - lag
+            self._response += beta * flows[first_row : first_row + self._block_rows]
+        self._flows[: self._older_rows] = self._flows[self._block_rows :]

@@ -1,6 +1,6 @@
 """Declare every argument of the environment once, in a dataclass that checks itself."""
 
-# ruff: noqa: RUF009 (`_arg` makes fields)
+# ruff: noqa: RUF009 (`_argument` makes fields)
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
-from typing import Any, Final, Generic, NamedTuple, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 
@@ -20,33 +20,14 @@ Value = TypeVar("Value")  # type of a `PlantNumbers` field: float, array, tensor
 _LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
 
-class Argument(NamedTuple):
-    """Declaration of one argument of the environment, without the argument's name and type."""
+def _argument(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
+    """Return a dataclass field for one argument of the environment.
 
-    default: Any
-    check: checks.Check  # returns a valid value in plain Python types, or raises a ValueError
-    unit: str
-    meaning: str
-
-
-def _arg(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
-    """Return a dataclass field whose metadata hold an `Argument` under the key "argument".
-
-    Parameters
-    ----------
-    default
-        Value of the argument if the caller passes none.
-    check
-        Function of an argument's name and value that returns the valid value in plain Python
-        types, or raises a ValueError.
-    unit
-        Unit for the table of arguments, "" for none.
-    meaning
-        Meaning for the table of arguments.
+    The metadata of the field hold the other three arguments of this function by name. `check`
+    is a function of the argument's name and value.
     """
-    return field(
-        default=default, metadata={"argument": Argument(default, check, unit, meaning)}
-    )
+    metadata = {"check": check, "unit": unit, "meaning": meaning}
+    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,49 +35,70 @@ class PlantNumbers(Generic[Value]):
     """The arguments of a plant that can differ from episode to episode, such as the delay.
 
     As arguments of the environment, the fields are of type `Number`: one number, or a range
-    [low, high] from which each reset of the environment draws one number. During an episode,
+    [low, high] from which each reset of the environment samples one number. During an episode,
     the fields are floats for one plant, and arrays or tensors for many plants.
 
-    At each reset, the plant draws a list of random numbers, and field i takes element i of this
-    list. The order of the fields therefore never changes, and a new field comes last: otherwise
-    a seed would stand for another plant.
+    If field i is a range, the number that a reset samples is computed from random number i of
+    the episode. The order of the fields therefore never changes, and a new field comes last:
+    otherwise a seed would stand for another plant.
     """
 
-    delay: Value = _arg(18, checks.samples, "samples", "transport delay d of (28)")
-    dead_zone: Value = _arg(5.0, checks.not_negative, "t/h", "half width of the dead zone (29)")
-    u_min: Value = _arg(-10.0, checks.number, "t/h", "U_min, the lower limit in (29)")
-    u_max: Value = _arg(10.0, checks.number, "t/h", "U_max, the upper limit in (29)")
-    noise_variance: Value = _arg(0.0, checks.not_negative, "degC^2", "variance R of xi in (28)")
-    measurement_noise_variance: Value = _arg(
+    delay: Value = _argument(
+        18, checks.samples, "samples", "transport delay d in equation (28)"
+    )
+    dead_zone: Value = _argument(
+        5.0, checks.not_negative, "t/h", "half width of the dead zone in equation (29)"
+    )
+    u_min: Value = _argument(
+        -10.0, checks.number, "t/h", "lower limit U_min of the flow in equation (29)"
+    )
+    u_max: Value = _argument(
+        10.0, checks.number, "t/h", "upper limit U_max of the flow in equation (29)"
+    )
+    noise_variance: Value = _argument(
+        0.0, checks.not_negative, "degC^2", "variance R of the noise xi in equation (28)"
+    )
+    measurement_noise_variance: Value = _argument(
         0.0, checks.not_negative, "degC^2", "variance of the transmitter's white noise"
     )
-    disturbance_amplitude: Value = _arg(
-        0.0, checks.not_negative, "degC", "largest level of the load's steps"
+    disturbance_amplitude: Value = _argument(
+        0.0, checks.not_negative, "degC", "largest magnitude of the load's levels"
     )
-    disturbance_interval: Value = _arg(
+    disturbance_interval: Value = _argument(
         150.0,
         checks.at_least_1,
         "samples",
-        "mean time between load steps; values below 10 are treated as 10",
+        "mean time between steps of the load; values below 10 are treated as 10",
     )
-    disturbance_walk_variance: Value = _arg(
-        0.0, checks.not_negative, "degC^2", "variance that the load's walk gains per sample"
+    disturbance_walk_variance: Value = _argument(
+        0.0,
+        checks.not_negative,
+        "degC^2",
+        "variance that the random walk of the load gains per sample",
     )
-    gain_factor: Value = _arg(1.0, checks.positive, "1", "multiple of the steady-state gain")
-    time_constant_factor: Value = _arg(
-        1.0, checks.positive, "1", "multiple of the dominant time constant"
-    )
-    gain_drift: Value = _arg(
-        1.0, checks.positive, "1", "gain after `drift_samples` divided by the initial one"
-    )
-    time_constant_drift: Value = _arg(
+    gain_factor: Value = _argument(
         1.0,
         checks.positive,
         "1",
-        "time constant after `drift_samples` divided by the initial one",
+        "steady-state gain at k = 0 divided by the gain of `a` and `b`",
+    )
+    time_constant_factor: Value = _argument(
+        1.0,
+        checks.positive,
+        "1",
+        "dominant time constant at k = 0 divided by the time constant of `a`",
+    )
+    gain_drift: Value = _argument(
+        1.0, checks.positive, "1", "gain at k = `drift_samples` divided by the gain at k = 0"
+    )
+    time_constant_drift: Value = _argument(
+        1.0,
+        checks.positive,
+        "1",
+        "time constant at k = `drift_samples` divided by the time constant at k = 0",
     )
 
-    def chosen(self, names: Iterable[str]) -> dict[str, Value]:
+    def select(self, names: Iterable[str]) -> dict[str, Value]:
         """Return the values of the fields with the names `names`, as a dict by name."""
         return {name: getattr(self, name) for name in names}
 
@@ -112,13 +114,13 @@ def slowest_pole(a: Sequence[float]) -> complex:
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters(PlantNumbers[Number]):
-    """The arguments of `MiddlePoint-v0`, checked and converted to plain Python types.
+    """The arguments of `MiddlePoint-v0`, checked and converted to Python's own types.
 
-    In the table, (28) is the paper's equation of the plant, and (29) that of the actuator; see
-    `MiddlePointEnv` for both equations and for the paper. The defaults are the first case of
-    the paper (Section 5, Fig. 5). All temperatures and flows are deviations from the operating
-    point. An asterisk marks an argument that can also be a range
-    [low, high], from which each `reset` draws a number.
+    In the table, (28) is the paper's equation of the plant, and (29) the paper's equation of
+    the actuator; see `MiddlePointEnv` for both equations and for the paper. The defaults are
+    the first case of the paper (Section 5, Fig. 5). All temperatures and flows are deviations
+    from the operating point. An asterisk marks an argument that can be a range [low, high],
+    from which each `reset` samples a number.
 
     <arguments>
 
@@ -132,101 +134,113 @@ class Parameters(PlantNumbers[Number]):
     # The plant, equation (28) of the paper, with temperature y, applied flow u_a, delay d and
     # white noise xi: A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k). With an unstable A, the
     # temperature y may grow beyond all floats.
-    a: Sequence[float] = _arg(
-        (1.0, -0.45181, -0.47546), checks.polynomial, "1", "A in (28), from z^0; begins with 1"
+    a: Sequence[float] = _argument(
+        (1.0, -0.45181, -0.47546),
+        checks.polynomial,
+        "1",
+        "coefficients of A in equation (28), from z^0 on; the first is 1",
     )
-    b: Sequence[float] = _arg(
-        (-0.04560, -0.00404), checks.numbers, "degC per t/h", "B in (28), from z^-1 on"
+    b: Sequence[float] = _argument(
+        (-0.04560, -0.00404),
+        checks.numbers,
+        "degC per t/h",
+        "coefficients of B in equation (28), from z^-1 on",
     )
-    c: Sequence[float] = _arg(
-        (1.0, -0.35740, -0.03392), checks.polynomial, "1", "C in (28), from z^0; begins with 1"
+    c: Sequence[float] = _argument(
+        (1.0, -0.35740, -0.03392),
+        checks.polynomial,
+        "1",
+        "coefficients of C in equation (28), from z^0 on; the first is 1",
     )
-    drift_samples: int = _arg(
-        1200, checks.duration, "samples", "duration of the drifts of gain and time constant"
+    drift_samples: int = _argument(
+        1200, checks.duration, "samples", "time in which gain and time constant drift"
     )
-    sampling_interval: float = _arg(8.0, checks.positive, "s", "scale of the time axis only")
+    sampling_interval: float = _argument(
+        8.0,
+        checks.positive,
+        "s",
+        "duration of a sample; the dynamics in samples do not depend on it",
+    )
     # The paper plots the set point, but does not state the set point's amplitude and period.
-    setpoint: str | float | Sequence[float] = _arg(
+    setpoint: str | float | Sequence[float] = _argument(
         "square",
         checks.setpoint,
         "degC",
         '"square", "random", a number (constant), or a list with a number for each sample, '
-        "the last one held: [-5, 5] is two samples, not a range",
+        "whose last number is held; [-5, 5] is a list for two samples, not a range",
     )
-    setpoint_amplitude: float = _arg(
+    setpoint_amplitude: float = _argument(
         5.0,
         checks.not_negative,
         "degC",
-        'A: "square" alternates between A and -A; "random" draws levels uniformly from [-A, A]',
+        'A: "square" alternates between A and -A; "random" samples levels uniformly from '
+        "[-A, A]",
     )
-    setpoint_period: int = _arg(
+    setpoint_period: int = _argument(
         600,
         checks.duration,
         "samples",
-        'P: "square" repeats every P samples; "random" holds a level for P/6 to P/2 samples, '
-        "uniformly",
+        'P: "square" repeats every P samples; "random" holds each level for a uniform random '
+        "number of samples from P/6 to P/2",
     )
     # The default observation is the six inputs of the paper's network: the set points y_d(k),
     # y_d(k-1), y_d(k-2) and the errors e(k), e(k-1), e(k-2).
-    setpoint_window: int = _arg(
-        3, checks.samples, "samples", "number of latest set points observed"
+    setpoint_window: int = _argument(
+        3, checks.samples, "samples", "number of latest set points in the observation"
     )
-    error_window: int = _arg(3, checks.samples, "samples", "number of latest errors observed")
-    output_window: int = _arg(
-        0, checks.samples, "samples", "number of latest measured outputs observed"
+    error_window: int = _argument(
+        3, checks.samples, "samples", "number of latest errors in the observation"
     )
-    action_window: int = _arg(
-        0, checks.samples, "samples", "number of latest past actions observed"
+    output_window: int = _argument(
+        0, checks.samples, "samples", "number of latest measured outputs in the observation"
     )
-    temperature_span: float = _arg(
+    action_window: int = _argument(
+        0, checks.samples, "samples", "number of latest past actions in the observation"
+    )
+    temperature_span: float = _argument(
         50.0,
         checks.positive,
         "degC",
-        "the transmitter's readings saturate at +- this value",
+        "largest magnitude of a reading of the transmitter, which saturates there",
     )
-    reward: str = _arg(
+    reward: str = _argument(
         "quadratic", checks.reward, "", 'form of the reward: "quadratic" or "absolute"'
     )
-    error_scale: float = _arg(
+    error_scale: float = _argument(
         5.0,
         checks.positive,
         "degC",
-        'error whose reward is -1/2 (if "quadratic") or -1 (if "absolute")',
+        'error for which the reward is -1/2 (if "quadratic") or -1 (if "absolute")',
     )
-    move_weight: float = _arg(
+    move_weight: float = _argument(
         0.0,
         checks.not_negative,
         "1",
-        "cost of changing the action by 1",
+        "cost of a change of the action by 1, subtracted from the reward",
     )
 
     def __post_init__(self) -> None:
         for name, argument in ARGUMENTS.items():
-            check = argument.check
+            check = argument.metadata["check"]
             if name in PLANT_NUMBERS:
-                check = partial(checks.or_range, check)
-            object.__setattr__(self, name, check(name, checks.plain(getattr(self, name))))
+                check = partial(checks.number_or_range, check)
+            value = check(name, checks.to_python(getattr(self, name)))
+            object.__setattr__(self, name, value)  # the dataclass is frozen
         self._check_actuator()
         if self.changes_time_constant:
             self._check_time_constant()
         is_stable = abs(slowest_pole(self.a)) < 1.0
         if self.is_disturbed and not is_stable:
-            load_values = tuple(self.chosen(_LOAD_ARGUMENTS).values())
+            values = self.disturbance_amplitude, self.disturbance_walk_variance
             allowed = "0 for this a: the plant is not stable, so it has no steady state"
-            reject(", ".join(_LOAD_ARGUMENTS), load_values, allowed)
+            reject(", ".join(_LOAD_ARGUMENTS), values, allowed)
         if not any(self.windows):
             names = "setpoint_window, error_window, output_window, action_window"
             reject(names, self.windows, "such that the observation has at least one element")
 
     @classmethod
     def of_environment(cls, arguments: Mapping[str, Any]) -> Parameters:
-        """Return the `Parameters` for the keyword arguments of an environment.
-
-        Parameters
-        ----------
-        arguments
-            Values of arguments of `Parameters`, by name; an argument that is missing has its
-            default.
+        """Return the `Parameters` for a dict of keyword arguments of an environment.
 
         Raises
         ------
@@ -249,18 +263,17 @@ class Parameters(PlantNumbers[Number]):
         return cls(**arguments)
 
     def _check_actuator(self) -> None:
-        """Raise a ValueError if draws of limits and dead zone could leave no command an effect.
+        """Raise a ValueError if, at some reset, no command could have an effect.
 
-        For all numbers that a reset may draw, `u_min` must be below `u_max`, and the dead zone
-        must not exceed the larger magnitude of the two limits.
+        For all numbers that a reset may sample, `u_min` must be below `u_max`, and the dead
+        zone must not exceed the larger magnitude of the two limits.
         """
         lowest_u_min, highest_u_min = self.range_of("u_min")
         lowest_u_max, highest_u_max = self.range_of("u_max")
         if highest_u_min >= lowest_u_max:
             reject("u_min", self.u_min, f"below u_max = {self.u_max}")
-        # The reach is the largest magnitude of a command, max(|u_min|, |u_max|), for the draws
-        # that make this magnitude smallest. Over a range [low, high], the smallest magnitude is
-        # max(low, -high, 0).
+        # The reach is the smallest value of max(|u_min|, |u_max|), the largest magnitude of a
+        # flow. Over a range [low, high], the smallest magnitude is max(low, -high, 0).
         reach = max(lowest_u_min, -highest_u_min, lowest_u_max, -highest_u_max, 0.0)
         _, largest_dead_zone = self.range_of("dead_zone")
         if largest_dead_zone > reach:
@@ -276,19 +289,20 @@ class Parameters(PlantNumbers[Number]):
         names = "time_constant_factor", "time_constant_drift"
         pole = slowest_pole(self.a)
         rate = 1.0 - pole.real  # 1 / time constant, per sample
-        (lowest_factor, _), (lowest_drift, _) = map(self.range_of, names)
-        allowed = ""
+        lowest_factor = self.lowest.time_constant_factor
+        lowest_drift = self.lowest.time_constant_drift
+        values = self.time_constant_factor, self.time_constant_drift
         if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
             allowed = f"1 for this a, whose slowest pole is {pole:g}, not one between 0 and 1"
-        elif lowest_factor * min(lowest_drift, 1.0) < rate:
+            reject(", ".join(names), values, allowed)
+        if lowest_factor * min(lowest_drift, 1.0) < rate:
             allowed = f"such that the factor is never below {rate:g}, where the pole is 0"
-        if allowed:
-            reject(", ".join(names), tuple(self.chosen(names).values()), allowed)
+            reject(", ".join(names), values, allowed)
 
     def range_of(self, name: str) -> tuple[float, float]:
-        """Return the lowest and the highest value of the field `name` of `PlantNumbers`.
+        """Return the range (low, high) of the field `name` of `PlantNumbers`.
 
-        Both values are equal if the field is one number instead of a range.
+        If the field is one number instead of a range, low and high are equal.
         """
         value = getattr(self, name)
         if isinstance(value, tuple):
@@ -298,8 +312,8 @@ class Parameters(PlantNumbers[Number]):
 
     @cached_property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """The ends (low, high) of each field of `PlantNumbers` that is a range, by name."""
-        numbers = self.chosen(PLANT_NUMBERS)
+        """The range (low, high) of each field of `PlantNumbers` that is a range, by name."""
+        numbers = self.select(PLANT_NUMBERS)
         return {name: value for name, value in numbers.items() if isinstance(value, tuple)}
 
     @cached_property
@@ -313,7 +327,7 @@ class Parameters(PlantNumbers[Number]):
         return self._can_differ(0.0, *_LOAD_ARGUMENTS)
 
     def _can_differ(self, value: float, *names: str) -> bool:
-        """Return whether any field of `PlantNumbers` in `names` can be other than `value`."""
+        """Return whether any of the fields `names` can have another value than `value`."""
         return any(self.range_of(name) != (value, value) for name in names)
 
     @cached_property
@@ -337,15 +351,11 @@ class Parameters(PlantNumbers[Number]):
         return self.setpoint_window, self.error_window, self.output_window, self.action_window
 
 
-ARGUMENTS: Final[dict[str, Argument]] = {
-    parameter.name: parameter.metadata["argument"] for parameter in fields(Parameters)
-}
-"""The declaration of every argument, by name."""
+ARGUMENTS: Final[dict[str, Any]] = {argument.name: argument for argument in fields(Parameters)}
+"""The dataclass field of every argument, by name."""
 
-# By name, the index of each field of `PlantNumbers`: at a reset, the field takes the random
-# number with this index, if the field is a range.
 PLANT_NUMBERS: Final = {number.name: i for i, number in enumerate(fields(PlantNumbers))}
-"""The index of the random number that a plant number takes at a reset, by name."""
+"""The index of each field of `PlantNumbers`, by name: also the index of its random number."""
 
 
 def argument_table() -> str:
@@ -359,14 +369,16 @@ def argument_table() -> str:
         default = repr(argument.default).replace("'", '"')
         if name in PLANT_NUMBERS:
             default += "*"
-        rows.append(f"| `{name}` | {default} | {argument.unit} | {argument.meaning} |")
+        unit = argument.metadata["unit"]
+        meaning = argument.metadata["meaning"]
+        rows.append(f"| `{name}` | {default} | {unit} | {meaning} |")
     return "\n".join(rows)
 
 
 def insert_table(docstring: str | None) -> str:
     """Return a docstring with the table of arguments in place of the text `<arguments>`.
 
-    `python -OO` removes docstrings: `docstring` is then None, and the result is "".
+    With `python -OO`, which removes docstrings, `docstring` is None and the result is "".
     """
     return inspect.cleandoc(docstring or "").replace("<arguments>", argument_table())
 
@@ -374,13 +386,14 @@ def insert_table(docstring: str | None) -> str:
 Parameters.__doc__ = insert_table(Parameters.__doc__)
 
 
-def spelt_out(function: Callable[..., Any]) -> inspect.Signature:
-    """Return the signature of a constructor that ends in `**arguments`, for help() and editors.
+def full_signature(constructor: Callable[..., Any]) -> inspect.Signature:
+    """Return the signature of an environment's `__init__` with all arguments of `Parameters`.
 
-    In the signature, all arguments of `Parameters` take the place of `**arguments`, and `self`
-    is left out. `function` is the `__init__` of an environment.
+    The signature, for help() and editors, has these arguments in place of `**arguments`, and no
+    `self`.
     """
-    _, *parameters, _ = inspect.signature(function).parameters.values()  # not self, **arguments
+    parameters = list(inspect.signature(constructor).parameters.values())
+    parameters = parameters[1:-1]  # without `self` and `**arguments`
     for parameter in inspect.signature(Parameters).parameters.values():
         annotation = parameter.annotation
         if parameter.name in PLANT_NUMBERS:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics
-from mptc_gym.plant.parameters import PLANT_NUMBERS, Parameters, PlantNumbers, slowest_pole
+from mptc_gym.plant.parameters import Parameters, PlantNumbers, slowest_pole
 
 
 class PlantState(NamedTuple):
-    """What a teacher, but no policy, may know of n plants at the present sample.
+    """The present state of n plants, for a teacher in training: a policy cannot observe it.
 
-    Each field has the shape (n,). The fields are NumPy arrays of float64, or PyTorch tensors of
-    the type and on the device of the environment.
+    The fields are NumPy arrays of float64, or PyTorch tensors of the environment's type and on
+    its device, of shape (n,).
     """
 
     delay: Any  # samples
@@ -30,53 +31,47 @@ def plant_state(
 ) -> PlantState:
     """Return delay, dead zone, gain, time constant and load of n plants at the present sample.
 
+    Each field of the result has the shape (n,), and the library and type of `load`.
+
     Parameters
     ----------
     parameters
-        The arguments of the plants.
+        The arguments of the environment.
     numbers
-        The plant numbers that resets drew for the arguments that are ranges, by name, shape
-        (n,).
+        The plant numbers that the latest resets sampled for the arguments that are ranges, by
+        name, shape (n,).
     ages
         The present sample k of each plant's episode, shape (n,).
     load
         The load disturbance w(k) of each plant, degC, shape (n,).
-
-    Returns
-    -------
-    PlantState
-        Arrays or tensors of shape (n,), of the library and type of `load`.
     """
-    nominal = {name: parameters.range_of(name)[0] for name in PLANT_NUMBERS}
-    plants: PlantNumbers[Any] = PlantNumbers(**{**nominal, **numbers})
+    plants: PlantNumbers[Any] = replace(parameters.lowest, **numbers)
     # Drifting dynamics change only at samples that are multiples of `DRIFT_INTERVAL`.
     changed_at = ages - ages % DRIFT_INTERVAL
     gain_factor, time_constant_factor = Dynamics(parameters).factors(plants, changed_at)
-    zeros = load * 0.0
+    zeros = load * 0.0  # to give each field the shape and type of the load
     return PlantState(
         delay=zeros + plants.delay,
         dead_zone=zeros + plants.dead_zone,
         gain=zeros + _nominal_gain(parameters) * gain_factor,
         time_constant=zeros + _nominal_time_constant(parameters) * time_constant_factor,
-        load=zeros + load,
+        load=zeros + load,  # a copy
     )
 
 
 def _nominal_gain(parameters: Parameters) -> float:
-    """Return the steady-state gain B(1) / A(1), degC per t/h; infinite where A(1) is 0.
+    """Return the steady-state gain B(1) / A(1), degC per t/h, or infinity if A(1) is 0.
 
-    A and B are the polynomials of equation (28) of the paper, with the coefficients `a` and `b`
-    of the arguments `parameters`.
+    A and B are the polynomials of equation (28) of the paper.
     """
     denominator = sum(parameters.a)
     return sum(parameters.b) / denominator if denominator else math.inf
 
 
 def _nominal_time_constant(parameters: Parameters) -> float:
-    """Return the time constant 1 / (1 - p) samples of the plant's slowest pole p, in seconds.
+    """Return the time constant of the plant's slowest pole p, 1 / (1 - p) samples, in seconds.
 
-    The result is NaN unless p is real and between 0 and 1. The pole p is that of 1 / A, with
-    the coefficients `a` of the arguments `parameters`.
+    The result is NaN unless the slowest pole is real and between 0 and 1.
     """
     pole = slowest_pole(parameters.a)
     if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:

@@ -27,8 +27,8 @@ from mptc_gym.environments.batch import BatchEnv, Infos, Mask
 from mptc_gym.environments.making import make_one
 from mptc_gym.plant.checks import is_count, one_of, reject
 from mptc_gym.plant.dynamics import FACTORS, action_from_command
-from mptc_gym.plant.parameters import ARGUMENTS, spelt_out
-from mptc_gym.plant.signals import FOREVER, Levels
+from mptc_gym.plant.parameters import ARGUMENTS, full_signature
+from mptc_gym.plant.signals import UNLIMITED, SetPointLevels
 from mptc_gym.torch_env.episodes import (
     LONGEST,
     SIGNALS,
@@ -161,13 +161,13 @@ class MiddlePointTorchEnv(BatchEnv):
         self._drawn_signals = make_signals(self.parameters, self._episodes)
         self._signals = self._drawn_signals  # random or external signals, by name
         self._external: dict[str, External] = {}  # external signals and plant numbers
-        self._last_sample = FOREVER  # the last k for which all external signals have a value
+        self._last_sample = UNLIMITED  # the last k for which all external signals have a value
         # On a CPU, a block of samples must fit in the processor's cache. On other devices,
         # blocks are as long as possible, since every call of PyTorch takes long.
         in_cache = LONGEST
         if self.device.type == "cpu":
             in_cache = max(1, _IN_CACHE // num_envs)
-        levels = Levels(self.parameters)
+        levels = SetPointLevels(self.parameters)
         shortest_level = levels.shortest if levels.random else LONGEST
         self._block = min(self._plants.most_samples, LONGEST, in_cache, shortest_level)
         # What the coming steps of the present block return, the next step last: rewards,
@@ -176,7 +176,7 @@ class MiddlePointTorchEnv(BatchEnv):
         self._window = _Window(self.parameters.windows, self._zeros)
         self._loads = History(self._zeros, 1)  # load w, degC
 
-    __signature__: ClassVar[inspect.Signature] = spelt_out(__init__)
+    __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> MiddlePointTorchEnv:
         """Return a copy, also in mid-episode, without the gradient graph of earlier actions."""
@@ -343,7 +343,7 @@ class MiddlePointTorchEnv(BatchEnv):
             signals = {name: self._external[name] for name in SIGNALS if name in self._external}
             self._signals = {**self._drawn_signals, **signals}
             last_samples = [signal.last_sample for signal in signals.values()]
-            self._last_sample = min(last_samples, default=FOREVER)
+            self._last_sample = min(last_samples, default=UNLIMITED)
         if seed is not None:
             self._episodes.generator.manual_seed(int(seed))
         self._np_random_seed = self._episodes.generator.initial_seed()
@@ -370,7 +370,7 @@ class MiddlePointTorchEnv(BatchEnv):
             values = a.detach() if a.requires_grad else a
             if not math.isfinite(values.dot(values).item()) and not values.isfinite().all():
                 reject("actions", actions, "finite")
-        if self._last_sample < FOREVER:
+        if self._last_sample < UNLIMITED:
             ages = self._clock - self._starts
             if self._ended is not None:  # this step resets the plants that have ended
                 ages = ages[~self._ended]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics, least_effective
+from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics, least_effective_command
 from mptc_gym.plant.parameters import Parameters, PlantNumbers
 from mptc_gym.torch_env.episodes import Block, Episodes, History, Number
 
@@ -30,7 +30,8 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     command
         Commanded flows u, t/h, shape (n,).
     edge
-        Magnitude above which a command passes the dead zone, t/h: see `least_effective`.
+        Magnitude above which a command passes the dead zone, t/h; see
+        `least_effective_command`.
     u_min, u_max
         Limits, t/h: two floats, or two tensors of shape (n,).
     """
@@ -124,7 +125,7 @@ class TorchPlants:
         self._middle = self._zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
         rounding = 2.0**-21 if self._zeros.dtype == torch.float32 else 2.0**-50
-        self._edge = least_effective(numbers["dead_zone"], u_min, u_max, rounding)
+        self._edge = least_effective_command(numbers["dead_zone"], u_min, u_max, rounding)
 
     def _reset_delays(self) -> None:
         """Compute the indices of each plant's delayed flows in all flows, if delays differ."""
@@ -146,7 +147,7 @@ class TorchPlants:
         if self._drifts:
             if isinstance(age, Tensor):
                 age = age.to(self._zeros.dtype)
-            share = self._dynamics.share(age - age % DRIFT_INTERVAL)
+            share = self._dynamics.drift_share(age - age % DRIFT_INTERVAL)
             self._factors = tuple(
                 _add_product(initial, share, change) for initial, change in self._drift
             )

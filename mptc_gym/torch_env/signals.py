@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mptc_gym.plant.parameters import Parameters
-from mptc_gym.plant.signals import LOAD_INTERVAL, Levels, colours
+from mptc_gym.plant.signals import LOAD_INTERVAL, SetPointLevels, noise_polynomials
 from mptc_gym.torch_env.episodes import Block, Episodes, External, History
 
 
@@ -82,7 +82,7 @@ class RandomSetPoint:
         The present episodes of the plants, which hold the random number generator.
     """
 
-    def __init__(self, levels: Levels, episodes: Episodes) -> None:
+    def __init__(self, levels: SetPointLevels, episodes: Episodes) -> None:
         self._distribution = levels
         self._episodes = episodes
         zeros = episodes.zeros
@@ -143,7 +143,7 @@ class RepeatedSetPoint:
         The present episodes of the plants.
     """
 
-    def __init__(self, levels: Levels, episodes: Episodes) -> None:
+    def __init__(self, levels: SetPointLevels, episodes: Episodes) -> None:
         self._n = len(episodes.zeros)
         self._values = episodes.zeros.new_tensor(levels.values)
         self._ends = torch.tensor(levels.lengths, device=self._values.device).cumsum(0)
@@ -247,11 +247,11 @@ def make_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal
     `parameters` are the arguments of the environment, and `episodes` the present episodes of
     its plants.
     """
-    levels = Levels(parameters)
+    levels = SetPointLevels(parameters)
     setpoint = RandomSetPoint if levels.random else RepeatedSetPoint
     signals: dict[str, Signal] = {"setpoint": setpoint(levels, episodes)}
     if parameters.is_disturbed:
         signals["disturbance"] = Disturbance(episodes)
-    for name, c in colours(parameters).items():
+    for name, c in noise_polynomials(parameters).items():
         signals[name] = Noise(name, c, episodes)
     return signals

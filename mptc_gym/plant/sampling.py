@@ -1,4 +1,4 @@
-"""Draw plant numbers, and give every episode of a plant its own random numbers.
+"""Sample plant numbers, and give every episode of a plant its own random numbers.
 
 The plant numbers are the fields of `PlantNumbers`, such as delay and dead zone.
 """
@@ -19,10 +19,8 @@ Values = NDArray[np.float64]  # one element per plant, shape (n,), or shape () f
 
 # Random numbers that each episode reserves for plant numbers: more than the present 13, so that
 # a new plant number does not change the random numbers that follow.
-DRAWS = 32
-# The state of a PCG64 that has just been created, apart from its position in the stream.
-_PCG64 = {"bit_generator": "PCG64", "has_uint32": 0, "uinteger": 0}
-# The seed of generators whose state is replaced at once: making a seed anew takes time.
+RESERVED_RANDOM_NUMBERS = 32
+# The seed of generators whose state is replaced at once: a seed that is made anew takes time.
 _ANY_SEED = np.random.SeedSequence(0)
 
 
@@ -38,7 +36,7 @@ class EpisodeStream:
 
     Parameters
     ----------
-    entropy, spawn_key, pool_size
+    entropy, spawn_key
         The arguments of the `numpy.random.SeedSequence` from which the stream starts.
 
     Attributes
@@ -49,12 +47,13 @@ class EpisodeStream:
     """
 
     # Without a dict per stream, the streams of 100,000 plants take little memory.
-    __slots__ = ("_episode", "_origin", "_seeds", "generator")
+    __slots__ = ("_entropy", "_episode", "_first_state", "_spawn_key", "generator")
 
     generator: np.random.Generator
 
-    def __init__(self, entropy: Any, spawn_key: tuple[int, ...], pool_size: int = 4) -> None:
-        self._seeds = entropy, spawn_key, pool_size
+    def __init__(self, entropy: Any, spawn_key: tuple[int, ...]) -> None:
+        self._entropy = entropy
+        self._spawn_key = spawn_key
         self._episode = 0
 
     def __deepcopy__(self, memo: dict[int, Any]) -> EpisodeStream:
@@ -67,22 +66,20 @@ class EpisodeStream:
         return duplicate
 
     def next_episode(self) -> np.random.Generator:
-        """Move to the start of the next episode and return the number generator there."""
+        """Return the generator, moved to the start of the stream's next episode."""
         if self._episode == 0:
-            entropy, spawn_key, pool_size = self._seeds
-            seeds = np.random.SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size)
+            seeds = np.random.SeedSequence(self._entropy, spawn_key=self._spawn_key)
             self.generator = np.random.Generator(np.random.PCG64(seeds))
-            self._origin = self.generator.bit_generator.state["state"]
+            self._first_state = self.generator.bit_generator.state
         else:
-            # The bit generator is looked up every time, as a copied generator has another one.
             bits: Any = self.generator.bit_generator
-            bits.state = {**_PCG64, "state": self._origin}
-            bits.advance(self._episode << 64)
+            bits.state = self._first_state
+            bits.advance(self._episode * 2**64)
         self._episode += 1
         return self.generator
 
 
-class Streams(NamedTuple):
+class RandomStreams(NamedTuple):
     """All random number streams of one plant.
 
     A further stream must be added at the end, so that the random numbers of the existing
@@ -95,92 +92,77 @@ class Streams(NamedTuple):
     measurement_noise: EpisodeStream
 
     @classmethod
-    def spawn(cls, seeds: np.random.SeedSequence) -> Streams:
+    def spawn(cls, seeds: np.random.SeedSequence) -> RandomStreams:
         """Return streams that start at new children of the seed sequence `seeds`.
 
-        Each call spawns further children, so that each call returns other streams.
+        A second call for the same seed sequence returns different streams.
         """
         children = seeds.spawn(len(cls._fields))
-        return cls(
-            *(
-                EpisodeStream(child.entropy, child.spawn_key, child.pool_size)
-                for child in children
-            )
-        )
+        return cls(*(EpisodeStream(child.entropy, child.spawn_key) for child in children))
 
     @classmethod
-    def of_seed(cls, seed: int) -> Streams:
+    def of_seed(cls, seed: int) -> RandomStreams:
         """Return the streams that `spawn` first returns for `SeedSequence(seed)`, faster."""
         return cls(*(EpisodeStream(seed, (child,)) for child in range(len(cls._fields))))
 
 
-class Ranges:
-    """Draw the plant numbers that are ranges, uniformly, at the start of each episode.
+class PlantSampler:
+    """Sample the plant numbers that are ranges, uniformly, at the start of each episode.
 
-    Numbers between two floats are drawn from [low, high), and integers from low to high, both
-    included. Every plant number has its own random number, whether the plant number is a range
-    or not. So the other plant numbers of a seed do not change if one more plant number becomes
-    a range.
+    Floats are sampled from [low, high), and integers from low to high, both included. Every
+    plant number has its own random number, whether the plant number is a range or not. So a
+    further range does not change the numbers that a seed samples for the other ranges.
 
     Parameters
     ----------
     parameters
         The arguments of the environment, of which the plant numbers may be ranges.
-
-    Attributes
-    ----------
-    lowest : PlantNumbers
-        All plant numbers, each range replaced by its low end, in arrays of shape ().
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._ranges = parameters.ranges
-        # The load disturbance takes random numbers from the stream `Streams.plant`, too, after
-        # the random numbers that are reserved for the plant numbers.
+        # The load disturbance takes random numbers from the stream `RandomStreams.plant`, too,
+        # after the random numbers that are reserved for the plant numbers.
         self._uses_stream = bool(self._ranges) or parameters.is_disturbed
         lowest = {name: np.array(number) for name, number in vars(parameters.lowest).items()}
-        self.lowest: PlantNumbers[Values] = PlantNumbers(**lowest)
+        # All plant numbers, in arrays of shape (), each range replaced by its low end.
+        self._lowest: PlantNumbers[Values] = PlantNumbers(**lowest)
 
-    def draw(self, streams: Sequence[Streams]) -> PlantNumbers[Values]:
-        """Begin the next episode of some plants, and return the plant numbers of this episode.
+    def sample(self, streams: Sequence[RandomStreams]) -> PlantNumbers[Values]:
+        """Begin the next episode of n plants, and return the plant numbers of this episode.
 
         Parameters
         ----------
         streams
-            The streams of each of these plants. The method begins the next episode of the
-            stream `plant` if a plant number or the load is random.
+            The random number streams of each of these plants. The stream `plant` moves to its
+            next episode if a plant number or the load is random.
 
         Returns
         -------
         PlantNumbers
-            Plant numbers that are ranges, drawn, in arrays of shape (len(streams),), and the
-            other plant numbers in arrays of shape ().
+            Plant numbers that are ranges, sampled, in arrays of shape (n,), and the other plant
+            numbers in arrays of shape ().
         """
         if not self._uses_stream:
-            return self.lowest
-        draws = np.empty((len(streams), DRAWS))
-        for plant_streams, row in zip(streams, draws, strict=True):
-            plant_streams.plant.next_episode().random(out=row)
+            return self._lowest
+        uniform = np.empty((len(streams), RESERVED_RANDOM_NUMBERS))
+        for streams_of_plant, uniform_of_plant in zip(streams, uniform, strict=True):
+            streams_of_plant.plant.next_episode().random(out=uniform_of_plant)
         numbers: dict[str, NDArray[Any]] = {}
         for name, (low, high) in self._ranges.items():
-            share = draws[:, PLANT_NUMBERS[name]]  # from 0 to 1, 1 excluded
+            share = uniform[:, PLANT_NUMBERS[name]]  # of the range, from 0 to 1, 1 excluded
             if isinstance(low, int):
                 numbers[name] = low + np.floor(share * (high + 1 - low)).astype(int)
             else:
                 numbers[name] = low + share * (high - low)
-        return replace(self.lowest, **numbers)
+        return replace(self._lowest, **numbers)
 
 
 def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
-    """Return the plant numbers of one of many plants, as Python numbers.
+    """Return the plant numbers of the plant with index `i`, as Python numbers.
 
-    Parameters
-    ----------
-    numbers
-        The plant numbers of many plants, in arrays of shape (n,), or of shape () for a number
-        that all plants share.
-    i
-        The index of the plant.
+    `numbers` holds the plant numbers of n plants: arrays of shape (n,), or of shape () for a
+    number that all plants share.
     """
     numbers_of_plant: dict[str, float] = {}
     for name, values in vars(numbers).items():
