@@ -455,6 +455,9 @@ REFUSED = {
         lambda: (lambda seen: np.zeros(len(seen)), NOISY), r"shape \(3, 1\), .*\(3,\)"),
     "actions that are not finite": (
         lambda: (lambda seen: np.full((len(seen), 1), np.nan), NOISY), "(?s)finite .*nan"),
+    "actions that are masked": (
+        lambda: (lambda seen: np.ma.masked_less(law(seen), 0.0), NOISY),
+        r"finite actions, shape \(3, 1\), got masked_array"),
     "actions that are text": (
         lambda: (lambda seen: [["open"]] * len(seen), NOISY), "finite.*open"),
     "tensors with gradients": (

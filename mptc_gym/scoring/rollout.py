@@ -88,10 +88,11 @@ def _checked(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         )
         reject("policy", actions, allowed)
     try:
-        checked = np.asarray(actions)
-        if checked.shape == shape and np.isfinite(checked).all():
+        checked = np.asarray(actions)  # of a masked array also the numbers behind the mask
+        is_masked = np.ma.is_masked(actions)
+        if checked.shape == shape and np.isfinite(checked).all() and not is_masked:
             return checked
-        received = f"{shorten(checked)}, shape {checked.shape}"
+        received = f"{shorten(actions)}, shape {checked.shape}"
     except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: from tensors
         received = f"{shorten(actions)} ({error})"
     raise ValueError(f"policy must return finite actions, shape {shape}, got {received}")
