@@ -117,6 +117,7 @@ class TestBatches:
         for message, arguments in {
             "n_envs must be an integer from 1": {"n_envs": 0},
             "group must be an integer from 1": {"group": 2},
+            "seed must be an integer from 0": {"seed": "a"},
             "env must be of this pack": {"env": DelayObservation(one(), delay=2).spec},
             "max_move must be": {"wrapper": {"max_move": 7}},
             "env must be the id of an environment": {"env": "Point-v0"},

@@ -256,6 +256,8 @@ def make_vec_env(
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
+    if seed is not None:
+        seed = count("seed", seed, 0, 2**63)
     render_mode = arguments.pop("render_mode", None)  # for the batch, but not for its spec
     single = make_one(env, arguments)
     if isinstance(wrapper, Mapping):
