@@ -27,11 +27,12 @@ from mptc_gym.environments.making import Env, make_batch, make_one
 from mptc_gym.plant.checks import reject
 from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.policies import form_of
-from mptc_gym.scoring.rollout import in_columns
+from mptc_gym.scoring.rollout import infos_in_arrays
 
 _POLICY_OF_A_MODEL: Final = "stable_baselines3.common.policies.BaseModel"
 
-# A vector environment of Gymnasium. `VectorEnv` as its type does not allow a list of seeds.
+# A vector environment of Gymnasium. It has no type `VectorEnv` here, as the method `reset` of
+# this type takes no list of seeds.
 Plants = Any
 
 
@@ -44,10 +45,9 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
     Parameters
     ----------
     env
-        As in `mptc_gym.evaluate`. If `env` is an environment, the vector environment holds a
-        copy of this environment. Environments that cannot be copied are used themselves, and
-        begin a new episode at the end of the context. If `env` is an id, a spec or a function,
-        the environments that are made are closed at the end of the context.
+        As in `mptc_gym.evaluate`. From an id, a spec or a function, environments are made,
+        which are closed at the end of the context. Environments are copied; those that cannot
+        be copied are used themselves, and begin a new episode at the end of the context.
     n
         Number of plants to make, if `env` is an id, a spec or a function.
     policy
@@ -77,33 +77,41 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
             copy = Copy(env)
             _refuse_training_environments(copy, target)
             plants = _as_vector(copy.env)
-            acts_itself = bool(copy.shared)
+            originals_act = bool(copy.shared)
         else:
             plants = _make(env, n, arguments)
-            acts_itself = False
+            originals_act = False
             stack.callback(plants.close)
         if not plant_groups(plants):
             allowed = "of MiddlePointEnv in NumPy, and open, such as an id or a spec of it"
             reject("env", env, allowed)
-        if acts_itself:  # the originals of some layers act, within copies of other layers
-            stack.enter_context(_frozen(env))
+        if originals_act:  # in layers that could not be copied, within copies of other layers
+            stack.enter_context(_statistics_frozen(env))
             stack.callback(_as_vector(env).reset, seed=_next_seeds(plants))
-        stack.enter_context(_frozen(plants))
+        stack.enter_context(_statistics_frozen(plants))
         yield plants
 
 
 def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
-    """Return n plants from an id or a spec, or from n calls of a function, as one environment.
+    """Return a vector environment with n plants from an id, a spec or a function.
 
-    `env` is the id, the spec or the function, and `arguments` are further arguments of an id or
-    a spec. A ValueError is raised if no environments can be made.
+    The function is called n times. A ValueError is raised if no environments can be made.
+
+    Parameters
+    ----------
+    env
+        An id, an `EnvSpec`, or a function that makes one environment.
+    n
+        Number of plants.
+    arguments
+        Further arguments of `gymnasium.make` for an id or a spec.
     """
     if isinstance(env, str | EnvSpec):
         single = make_one(env, arguments)
         batch = make_batch(single, n)
-        if batch is None:
-            return _in_turn([single, *(make_one(env, arguments) for _ in range(n - 1))])
-        return batch
+        if batch is not None:
+            return batch
+        return _sync_vector_env([single, *(make_one(env, arguments) for _ in range(n - 1))])
     if not callable(env):
         allowed = "an id, an EnvSpec, environments, or a function that makes one"
         reject("env", env, f"{allowed} (a model that was loaded has no environments)")
@@ -112,16 +120,18 @@ def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
         if not isinstance(environment, gymnasium.Env):
             allowed = "a function that makes one environment; where it makes many, call it"
             reject("env", environment, allowed)
-    return _in_turn(environments)
+    return _sync_vector_env(environments)
 
 
-def _in_turn(environments: list[Env]) -> Plants:
+def _sync_vector_env(environments: list[Env]) -> Plants:
     """Return a vector environment that steps the given environments one after another."""
+    # SyncVectorEnv takes functions that make environments. The default argument keeps the
+    # environment of each function.
     return SyncVectorEnv([lambda env=env: env for env in environments])  # type: ignore[misc]
 
 
 def _as_vector(env: Any) -> Plants:
-    """Return an environment of any kind, as a vector environment of Gymnasium.
+    """Return an environment of any kind as a vector environment of Gymnasium.
 
     `env` is a single environment, a vector environment of Gymnasium, or a `VecEnv` of
     Stable-Baselines3.
@@ -130,7 +140,7 @@ def _as_vector(env: Any) -> Plants:
         return env
     if not isinstance(env, gymnasium.Env):
         return _FromVecEnv(env)
-    plants = _in_turn([env])
+    plants = _sync_vector_env([env])
     # Some versions of Gymnasium close the environments within a vector environment when the
     # vector environment is deleted, unless it is closed.
     plants.closed = True
@@ -176,32 +186,33 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
         else:
             self.venv.seed(seed[0])
         observations = self.venv.reset()
-        return observations, {**in_columns(innermost.reset_infos)}
+        return observations, {**infos_in_arrays(innermost.reset_infos)}
 
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all plants, and return observations, rewards, flags and infos, all in arrays.
 
         `actions` has one row for each plant. The flags say which episodes have ended; all ended
-        episodes count as terminated.
+        episodes count as terminated, and none as truncated.
         """
         observations, rewards, ended, infos = self.venv.step(actions)
-        # A `GymnasiumVecEnv` fills its list of infos only where episodes end.
-        columns = in_columns(infos) or getattr(self.venv.unwrapped, "infos", {})
-        return observations, rewards, ended, np.zeros_like(ended), {**columns}
+        # A `GymnasiumVecEnv` fills its list of infos only where episodes end, and has the infos
+        # of all plants in its attribute `infos`.
+        arrays = infos_in_arrays(infos) or getattr(self.venv.unwrapped, "infos", {})
+        return observations, rewards, ended, np.zeros_like(ended), {**arrays}
 
 
 def _refuse_training_environments(copy: Copy, target: Any) -> None:
-    """Raise a ValueError if `target`, a policy, may train in layers that a copy shares.
+    """Raise a ValueError if a policy may train in layers that copy and original share.
 
-    The `policy` of a model of Stable-Baselines3 does not know the environments of the model, so
-    it may train in any.
+    `target` is the model or another object behind the policy. The attribute `policy` of a model
+    of Stable-Baselines3 does not know the model's environments, so it may train in any.
     """
     training = getattr(target, "env", None)
     trains_there = is_environment(training) and any(
         id(layer) in copy.shared for layer in layers(training)
     )
-    is_part_of_a_model = isinstance(target, loaded(_POLICY_OF_A_MODEL))
-    if trains_there or (copy.shared and is_part_of_a_model):
+    is_policy_of_a_model = isinstance(target, loaded(_POLICY_OF_A_MODEL))
+    if trains_there or (copy.shared and is_policy_of_a_model):
         raise ValueError(
             "env must not be the training environments of policy, as these cannot be copied "
             f"({copy.reason}): make others like them, and pass the model itself, or use "
@@ -212,22 +223,22 @@ def _refuse_training_environments(copy: Copy, target: Any) -> None:
 def _next_seeds(plants: Plants) -> list[int]:
     """Return a seed for a new episode of each plant, computed from the present seeds.
 
-    With these seeds, the environments of a user do not go on with the episodes of a score, and
-    a user who seeds the environments can repeat a program.
+    The seeds keep a user's environments from going on with the episodes of a score. As the
+    seeds are computed, a program that seeds its environments can be repeated.
     """
-    present = np.ravel(plants.unwrapped.np_random_seed).tolist()
-    # A negative number is Gymnasium's value for a seed that Gymnasium does not know.
-    entropy = [abs(seed) for seed in present if seed is not None]
+    present_seeds = np.ravel(plants.unwrapped.np_random_seed).tolist()
+    # A SeedSequence takes no negative number, which is Gymnasium's value for an unknown seed.
+    entropy = [abs(seed) for seed in present_seeds if seed is not None]
     seeds: list[int] = np.random.SeedSequence(entropy).generate_state(plants.num_envs).tolist()
     return seeds
 
 
 @contextmanager
-def _frozen(env: Any) -> Iterator[None]:
+def _statistics_frozen(env: Any) -> Iterator[None]:
     """Return a context in which no wrapper of an environment updates its statistics."""
     with ExitStack() as stack:
         for layer in layers(env):
-            flag = normaliser_flag(layer)
+            flag = normaliser_flag(layer)  # name of an attribute; "" if there are no statistics
             if flag:
                 stack.callback(setattr, layer, flag, getattr(layer, flag))
                 setattr(layer, flag, False)
