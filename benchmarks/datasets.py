@@ -174,17 +174,17 @@ def write(root: Path, name: str, episodes: int) -> str:
     logged = record(*IDS[name], episodes)
     try:
         # Minari does not list the contents of hidden folders.
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as folder:
             # HDF5 crashes if the disk is full. A file as large as the data set is written and
             # removed first: on a full disk, this raises an OSError.
-            room = Path(partial, "room")
+            room = Path(folder, "room")
             room.write_bytes(bytes(1_000_000 + episodes * 250_000))
             room.unlink()
-            os.environ[FOLDER_VARIABLE] = partial  # Minari takes no folder as an argument
+            os.environ[FOLDER_VARIABLE] = folder  # Minari takes no folder as an argument
             mean_errors = _create(name, logged)
             shutil.rmtree(destination, ignore_errors=True)
             destination.parent.mkdir(parents=True, exist_ok=True)
-            Path(partial, name).replace(destination)
+            Path(folder, name).replace(destination)
     except OSError as error:
         raise UnfinishedError(f"{destination} could not be written: {error}") from error
     finally:

@@ -356,9 +356,9 @@ def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
 
 @cache
 def _read_bounds() -> dict[Parameters, dict[int, Values]]:
-    """Return the bounds that the package has, from the file `bounds.json`.
+    """Return all bounds of the package, from its file `bounds.json`.
 
-    The command `python -m benchmarks.bounds --package` writes the file.
+    In a checkout, `python -m benchmarks.bounds --package` writes the file.
 
     Returns
     -------

@@ -85,11 +85,12 @@ class Recurrent(nn.Module):
         `observations` is an array of shape (n, size): equal numbers of latest set points and
         latest errors, degC, newest first.
         """
-        seen = torch.as_tensor(np.asarray(observations), dtype=torch.float32)
+        signals = torch.as_tensor(np.asarray(observations), dtype=torch.float32)
+        n, size = signals.shape
         if not self.has_begun:
-            self.begin(len(seen))
+            self.begin(n)
         with torch.no_grad():
-            actions = self(seen[:, 0], seen[:, seen.shape[1] // 2])
+            actions = self(setpoint=signals[:, 0], error=signals[:, size // 2])
         array: np.ndarray[Any, Any] = actions.numpy()
         return array
 

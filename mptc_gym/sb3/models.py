@@ -315,7 +315,7 @@ class ScoreCallback(BaseCallback):
                 save(self.model, self.path)
                 self._has_saved = True
         if self.verbose:
-            total = self.locals["total_timesteps"]
+            total = self.locals["total_timesteps"]  # of the training
             mark = "; best" if is_best else ""
             print(f"{self.num_timesteps:,} of {total:,} samples: {result}{mark}", flush=True)
 

@@ -42,7 +42,7 @@ _PIPE_ENDS: Final[set[Any]] = {
 
 
 class Copy:
-    """A copy of an environment and all environments within, also in mid-episode.
+    """A copy of an environment and all environments within it, at their present samples.
 
     The copy writes to no file of the original, and closes nothing. Layers that run in other
     processes, show a window, or raise an error when they are copied are not copied: copy and

@@ -23,8 +23,8 @@ from mptc_gym.environments.layers import (
 from mptc_gym.scoring.opening import Plants
 from mptc_gym.scoring.policies import form_of
 
-# The classes of Stable-Baselines3 whose objects know the spaces of their training: a model, and
-# the policy of a model.
+# The classes of Stable-Baselines3 whose objects know the spaces of their training: models, and
+# policies of models.
 _MODELS: Final = (
     "stable_baselines3.common.base_class.BaseAlgorithm",
     "stable_baselines3.common.policies.BaseModel",
@@ -79,7 +79,8 @@ def _check_statistics(normaliser: Any) -> None:
 
     Statistics with mean 0 and variance 1 are initial statistics: no training has updated them.
     """
-    statistics = vars(normaliser).get("obs_rms", {})  # no statistics if only rewards are normal
+    # A wrapper of rewards alone has no statistics of observations.
+    statistics = vars(normaliser).get("obs_rms", {})
     parts = statistics.values() if isinstance(statistics, dict) else [statistics]
     for part in parts:
         if not part.mean.any() and (part.var == 1.0).all():
@@ -98,7 +99,7 @@ def _check_training(model: Any, plants: Plants) -> None:
     Parameters
     ----------
     model
-        A model of Stable-Baselines3, or the policy of a model.
+        A model of Stable-Baselines3, or the attribute `policy` of a model.
     plants
         A vector environment of Gymnasium in which the model is to act.
     """

@@ -165,7 +165,7 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
 
     @property
     def np_random_seed(self) -> Any:
-        """The latest seed of each plant, in a list, as each environment reports its seed."""
+        """A list of the latest seed of each plant."""
         return self.venv.get_attr("np_random_seed")
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
@@ -223,8 +223,8 @@ def _refuse_training_environments(copy: Copy, target: Any) -> None:
 def _next_seeds(plants: Plants) -> list[int]:
     """Return a seed for a new episode of each plant, computed from the present seeds.
 
-    The seeds keep a user's environments from going on with the episodes of a score. As the
-    seeds are computed, a program that seeds its environments can be repeated.
+    With these seeds, the environments of a user do not go on with the episodes of a score. The
+    seeds are not random, so that a user can repeat a program.
     """
     present_seeds = np.ravel(plants.unwrapped.np_random_seed).tolist()
     # A SeedSequence takes no negative number, which is Gymnasium's value for an unknown seed.
@@ -240,6 +240,7 @@ def _statistics_frozen(env: Any) -> Iterator[None]:
         for layer in layers(env):
             flag = normaliser_flag(layer)  # name of an attribute; "" if there are no statistics
             if flag:
+                # Put the present value back at the end of the context.
                 stack.callback(setattr, layer, flag, getattr(layer, flag))
                 setattr(layer, flag, False)
         yield

@@ -108,10 +108,10 @@ def start(policy: Any, n: int) -> Act:
 def _act_by_predict(predict: Callable[..., Any], n: int) -> Act:
     """Return a function of observations that calls `predict` as Stable-Baselines3 does.
 
-    The function is for one episode of n plants: it passes the state that `predict` returns,
-    such as that of a recurrent network, to the next call of `predict`. The keywords `state`,
-    `episode_start` and `deterministic=True` are passed if `predict` takes them and no
-    `functools.partial` has set them.
+    The function serves for one episode of n plants. The state that `predict` returns, such as
+    the state of a recurrent network, is passed to the next call of `predict`. `predict` gets
+    the keywords `state`, `episode_start` and `deterministic=True`, without keywords that it
+    does not take, and without keywords that a `functools.partial` has set.
     """
     parameters = inspect.signature(predict).parameters.values()
     names = {parameter.name for parameter in parameters}

@@ -91,7 +91,7 @@ def _checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         )
         reject("policy", actions, allowed)
     try:
-        checked = np.asarray(actions)  # of a masked array also the numbers behind the mask
+        checked = np.asarray(actions)  # which drops the mask of a masked array
         is_masked = np.ma.is_masked(actions)
         if checked.shape == shape and np.isfinite(checked).all() and not is_masked:
             return checked
