@@ -34,10 +34,10 @@ BEHAVIOURS = {
 # predictor has another anti-windup, and the Smith predictor and the PI controller `pi-simc` are
 # tuned to an Ms (largest magnitude of the sensitivity function) of 1.6.
 VERSIONS = {"pi": 0, "smith": 1, "mixed": 1}
-# The plant, that is a preset, and the behaviour of each data set.
+# The preset and the behaviour of each data set.
 IDS = {
-    f"middlepoint/{plant}/{behaviour}-v{VERSIONS[behaviour]}": (plant, behaviour)
-    for plant in ("paper", "disturbed", "fouling")
+    f"middlepoint/{preset}/{behaviour}-v{VERSIONS[behaviour]}": (preset, behaviour)
+    for preset in ("paper", "disturbed", "fouling")
     for behaviour in BEHAVIOURS
 }
 FOLDER_VARIABLE = "MINARI_DATASETS_PATH"  # the environment variable that names Minari's folder
@@ -73,18 +73,16 @@ def work(options: Options) -> str:
     """Write data sets, print the mean errors of each data set, and return a last message."""
     folder = Path(os.environ.get(FOLDER_VARIABLE) or DEFAULT_FOLDER)
     root = out_folder(folder.expanduser().absolute(), FOLDER_VARIABLE)
-    for name in dict.fromkeys(options.ids or IDS):  # without repeated ids
-        print(f"{name}: {write(root, name, options.episodes)}", flush=True)
+    for dataset_id in dict.fromkeys(options.ids or IDS):  # without repeated ids
+        mean_errors = write(root, dataset_id, options.episodes)
+        print(f"{dataset_id}: {mean_errors}", flush=True)
     return f"The data sets are in {root}"
 
 
-def arguments_of(plant: str) -> dict[str, Any]:
-    """Return the arguments of the environment in which the data sets of a plant are collected.
-
-    `plant` is the name of a preset.
-    """
+def arguments_of(preset: str) -> dict[str, Any]:
+    """Return the arguments of the environment from which data sets of a preset are logged."""
     return {
-        **PRESETS[plant],
+        **PRESETS[preset],
         "setpoint": "random",
         "reward": "absolute",  # with `error_scale`, the reward is -|e|, degC
         "error_scale": 1.0,
@@ -94,43 +92,29 @@ def arguments_of(plant: str) -> dict[str, Any]:
     }
 
 
-def record(plant: str, behaviour: str, episodes: int = EPISODES) -> list[Episode]:
-    """Return logged episodes of a plant under the controllers of a behaviour.
+def record(preset: str, behaviour: str, episodes: int = EPISODES) -> list[Episode]:
+    """Return logged episodes of a preset under the controllers of a behaviour.
 
-    Parameters
-    ----------
-    plant
-        Name of a preset.
-    behaviour
-        Key of `BEHAVIOURS`.
-    episodes
-        Number of episodes. Episode i has the seed `SEED + i`.
+    Episode i has the seed `SEED + i`.
     """
     controllers = BEHAVIOURS[behaviour][:episodes]
     recorded: list[Episode] = []
     for turn, controller in enumerate(controllers):
         seeds = list(range(SEED + turn, SEED + episodes, len(controllers)))
-        recorded += _record_controller(plant, controller, seeds)
+        recorded += _record_controller(preset, controller, seeds)
     return sorted(recorded, key=lambda episode: episode.seed)
 
 
-def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]:
-    """Return a logged episode of a plant under a controller for each seed.
+def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> list[Episode]:
+    """Return a logged episode of a preset under a controller for each seed.
 
-    Parameters
-    ----------
-    plant
-        Name of a preset.
-    name
-        Name of the controller.
-    seeds
-        The seeds of the episodes. The plants of all seeds are stepped together.
+    The plants of all seeds are stepped together.
     """
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.loop.rollout import make_plants
 
-    arguments = arguments_of(plant)
-    controller: Any = ROSTER[name].in_service(arguments, len(seeds), SEED)
+    arguments = arguments_of(preset)
+    controller: Any = ROSTER[controller_name].in_service(arguments, len(seeds), SEED)
     controller.reset()
     actions: list[NDArray[np.float32]] = []  # of each sample, shape (episodes, 1)
 
@@ -150,28 +134,19 @@ def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]
     actions_of_all = np.stack(actions)
     # Arrays have the shape (samples, episodes, ...).
     return [
-        Episode(name, seed, observations[:, i], actions_of_all[:, i], rewards[:, i])
+        Episode(controller_name, seed, observations[:, i], actions_of_all[:, i], rewards[:, i])
         for i, seed in enumerate(seeds)
     ]
 
 
-def write(root: Path, name: str, episodes: int) -> str:
+def write(root: Path, dataset_id: str, episodes: int) -> str:
     """Collect a data set, write it to Minari's folder, and return its mean errors as text.
 
-    The data set replaces an older data set of the same id. If the files cannot be written, an
-    `UnfinishedError` is raised, and no incomplete data set remains.
-
-    Parameters
-    ----------
-    root
-        Minari's folder.
-    name
-        The id of the data set, a key of `IDS`.
-    episodes
-        Number of episodes to collect.
+    The data set replaces an older data set of this id in Minari's folder `root`. If the files
+    cannot be written, an `UnfinishedError` is raised, and no incomplete data set remains.
     """
-    destination = root / name
-    logged = record(*IDS[name], episodes)
+    destination = root / dataset_id
+    logged = record(*IDS[dataset_id], episodes)
     try:
         # Minari does not list the contents of hidden folders.
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as folder:
@@ -181,10 +156,10 @@ def write(root: Path, name: str, episodes: int) -> str:
             room.write_bytes(bytes(1_000_000 + episodes * 250_000))
             room.unlink()
             os.environ[FOLDER_VARIABLE] = folder  # Minari takes no folder as an argument
-            mean_errors = _create(name, logged)
+            mean_errors = _create(dataset_id, logged)
             shutil.rmtree(destination, ignore_errors=True)
             destination.parent.mkdir(parents=True, exist_ok=True)
-            Path(folder, name).replace(destination)
+            Path(folder, dataset_id).replace(destination)
     except OSError as error:
         raise UnfinishedError(f"{destination} could not be written: {error}") from error
     finally:
@@ -192,17 +167,16 @@ def write(root: Path, name: str, episodes: int) -> str:
     return mean_errors
 
 
-def _create(name: str, episodes: list[Episode]) -> str:
+def _create(dataset_id: str, episodes: list[Episode]) -> str:
     """Write logged episodes as a data set to Minari's folder; return mean errors as text.
 
-    The environment variable `FOLDER_VARIABLE` names the folder. `name` is the id of the data
-    set, a key of `IDS`.
+    The environment variable `FOLDER_VARIABLE` names the folder.
     """
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    plant, behaviour = IDS[name]
-    arguments = arguments_of(plant)
+    preset, behaviour = IDS[dataset_id]
+    arguments = arguments_of(preset)
     idle = evaluate(
         lambda observations: np.zeros((len(observations), 1)),
         episodes=EVALUATION_EPISODES,
@@ -223,7 +197,7 @@ def _create(name: str, episodes: list[Episode]) -> str:
     ]
     env = gymnasium.make("MiddlePoint-v0", max_episode_steps=SAMPLES, **arguments)
     dataset = minari.create_dataset_from_buffers(
-        name,
+        dataset_id,
         buffers,
         env=env,
         eval_env=env,
@@ -231,7 +205,7 @@ def _create(name: str, episodes: list[Episode]) -> str:
         author="The mptc_gym developers",
         author_email="",  # Minari warns if this argument or the next one is None
         code_permalink="",
-        description=f"Preset {plant} with random set points. The reward is -|error| in degC.",
+        description=f"Preset {preset} with random set points. The reward is -|error| in degC.",
         ref_min_score=-idle.mean_error * SAMPLES,
         ref_max_score=-idle.least_possible * SAMPLES,
         num_episodes_average_score=EVALUATION_EPISODES,

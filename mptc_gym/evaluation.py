@@ -230,21 +230,8 @@ class _Runs(NamedTuple):
 def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _Runs:
     """Run an episode of a policy for each seed, in rounds of as many episodes as plants.
 
-    Parameters
-    ----------
-    policy
-        A policy, as in `evaluate`.
-    plants
-        A vector environment in which the policy acts.
-    seeds
-        The seeds of the episodes.
-    parameters
-        The arguments of the plants.
-
-    Raises
-    ------
-    ValueError
-        If episodes have different lengths, or if the episodes are not those of the seeds.
+    A ValueError is raised if episodes have different lengths, or if their noise, load or set
+    points are not those of the seeds.
     """
     n = plants.num_envs
     rounds: list[_Runs] = []
@@ -265,7 +252,6 @@ def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _
 def _measure(samples: Iterator[Sample], n: int) -> _Runs:
     """Return errors and valve travels of n plants from the samples of one episode.
 
-    `samples` are those of k = 0, 1, 2, ...; samples after the end of the episode are not used.
     A ValueError is raised if not all plants end the episode at the same sample.
     """
     next(samples)  # sample k = 0, which no policy has affected
@@ -293,8 +279,7 @@ def _refuse_lengths(length: int) -> NoReturn:
 def _why_idle(travels: Values, parameters: Parameters) -> str:
     """Return why the valve has never moved, and what helps; "" if the valve has moved.
 
-    `travels` are the valve travels of the episodes, t/h, and `parameters` are the arguments of
-    the plants.
+    `travels` are the valve travels of the episodes, t/h.
     """
     if travels.any():
         return ""
@@ -318,14 +303,7 @@ class Bound(NamedTuple):
 def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
     """Return the least possible mean error of each episode, or why the package has none.
 
-    Parameters
-    ----------
-    parameters
-        The arguments of the plants.
-    length
-        Number of samples N of an episode.
-    seeds
-        The seeds of the episodes.
+    `length` is the number of samples of an episode, and each episode has one of the seeds.
     """
     least_by_seed = _read_bounds().get(case_of(parameters))
     if least_by_seed is None:
@@ -356,9 +334,7 @@ def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
 
 @cache
 def _read_bounds() -> dict[Parameters, dict[int, Values]]:
-    """Return all bounds of the package, from its file `bounds.json`.
-
-    In a checkout, `python -m benchmarks.bounds --package` writes the file.
+    """Return all bounds of the package, which `python -m benchmarks.bounds --package` wrote.
 
     Returns
     -------
@@ -387,10 +363,7 @@ def case_of(parameters: Parameters) -> Parameters:
 
 
 def _idle_errors(parameters: Parameters, seeds: range) -> Values:
-    """Return the mean error of each episode if the valve never moves, degC.
-
-    `parameters` are the arguments of the plants, and `seeds` are the seeds of the episodes.
-    """
+    """Return the mean error of the episode of each seed if the valve never moves, degC."""
     n = len(seeds)
     plants = MiddlePointVectorEnv(n, **asdict(parameters))
     idle_action = action_from_command(0.0, parameters.u_min, parameters.u_max)
@@ -402,14 +375,8 @@ def _idle_errors(parameters: Parameters, seeds: range) -> Values:
 def _with_scores(evaluation: Evaluation, least: Values, idle_errors: Values) -> Evaluation:
     """Return an evaluation with the fields that need a bound, such as the score.
 
-    Parameters
-    ----------
-    evaluation
-        An evaluation without these fields.
-    least
-        Least possible mean error of each episode, degC.
-    idle_errors
-        Mean error of each episode if the valve never moves, degC.
+    For each episode, `least` is the least possible mean error, and `idle_errors` is the mean
+    error if the valve never moves, both in degC.
     """
     gained = idle_errors - evaluation.errors
     possible = idle_errors - least

@@ -31,6 +31,7 @@ LARGEST_MOVE = 0.4  # largest change of the action per sample; half the actuator
 # Number of past actions among the inputs: enough for all flows that have not yet shown in the
 # output, for the longest delay.
 MEMORY = 26
+NODES = 64  # nodes of the recurrent unit
 
 
 class Recurrent(nn.Module):
@@ -38,22 +39,18 @@ class Recurrent(nn.Module):
 
     With the methods `reset` and `act`, the network is a policy for `mptc_gym.evaluate` and for
     the command `benchmarks.compare`.
-
-    Parameters
-    ----------
-    nodes
-        Number of nodes of the recurrent unit.
     """
 
-    def __init__(self, nodes: int = 64) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.cell = nn.GRUCell(2 + MEMORY, nodes)
-        self.output = nn.Linear(nodes + 2 + MEMORY, 1)
+        inputs = 2 + MEMORY  # set point, error and past actions
+        self.cell = nn.GRUCell(inputs, NODES)
+        self.output = nn.Linear(NODES + inputs, 1)
         self.reset()
 
     def begin(self, n: int) -> None:
         """Set the state and the past actions to 0, for n plants at rest."""
-        self.state = torch.zeros(n, self.cell.hidden_size)
+        self.state = torch.zeros(n, NODES)
         self.actions = torch.zeros(n, MEMORY)  # newest first
         self.has_begun = True
 

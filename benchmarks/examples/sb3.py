@@ -69,8 +69,8 @@ def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
         Observations of the environment, shape (n, size): latest set points, errors, outputs and
         actions, in this order, each newest first.
     windows
-        The numbers of set points, errors, outputs and actions in an observation, in this order;
-        one error.
+        The numbers of set points, errors (one), outputs and actions in an observation, in this
+        order.
 
     Returns
     -------
@@ -112,17 +112,11 @@ def changes(window: Tensor, single: int) -> Tensor:
 
 
 class Changes(BaseFeaturesExtractor):
-    """The inputs of policy and value function, computed by `inputs`, as a feature extractor.
+    """The inputs of policy and value function, computed by `inputs`, as a feature extractor."""
 
-    Parameters
-    ----------
-    space
-        The observation space of an environment with the windows `WINDOWS`.
-    """
-
-    def __init__(self, space: Any) -> None:
+    def __init__(self, observation_space: Any) -> None:
         # An error, and 2, 12 and 34 changes of set point, output and action.
-        super().__init__(space, features_dim=49)
+        super().__init__(observation_space, features_dim=49)
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return the inputs, shape (n, 49), for observations of shape (n, size)."""
@@ -136,15 +130,7 @@ class GroupBuffer(RolloutBuffer):
     """
 
     def compute_returns_and_advantage(self, last_values: Tensor, dones: Any) -> None:
-        """Compute returns and advantages, and subtract the groups' means from the advantages.
-
-        Parameters
-        ----------
-        last_values
-            Value of the observation after the last sample of each plant.
-        dones
-            Whether the episode of each plant ended at the last sample.
-        """
+        """Compute returns and advantages, and subtract the group's mean from each advantage."""
         super().compute_returns_and_advantage(last_values, dones)
         # A view: the subtraction changes `self.advantages`, shape (samples, plants).
         groups = self.advantages.reshape(self.buffer_size, -1, GROUP)
@@ -159,10 +145,8 @@ class Exploration(BaseCallback):
 
     Parameters
     ----------
-    first
-        The natural logarithm at the start of the training.
-    last
-        The natural logarithm at the end of the training.
+    first, last
+        The natural logarithm at the start and at the end of the training.
     """
 
     def __init__(self, first: float, last: float) -> None:

@@ -83,10 +83,7 @@ class Curve(BaseCallback):
         return bool(self._due_times)
 
     def _append_score(self, training_seconds: float) -> None:
-        """Score the policy on validation episodes, and append a row to the CSV file.
-
-        `training_seconds` is the processor time of the training so far.
-        """
+        """Score the policy on validation episodes, and append a row to the CSV file."""
         spec = spec_of(self.model, IDS["hard"])
         result = evaluate(self.model, spec, episodes=EPISODES, seed=VALIDATION_SEED)
         assert result.score is not None  # the package has bounds of validation episodes

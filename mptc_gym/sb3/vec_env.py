@@ -176,7 +176,10 @@ class GymnasiumVecEnv(VecEnv):
 
     def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise a NotImplementedError: no environment of a batch has methods of its own."""
-        raise NotImplementedError(f"use `batches`, for all at once, got {args or kwargs}")
+        raise NotImplementedError(
+            "use `batches`, as an environment of a batch has no methods of its own, got "
+            f"{args or kwargs}"
+        )
 
     set_attr = env_method
 
@@ -203,13 +206,9 @@ def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
 def _infos_of_one(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
     """Return the info that one environment of a batch would return if it were alone.
 
-    Parameters
-    ----------
-    infos
-        The infos of the batch: for each name an array with an element for each environment, and
-        under "_name" a mask that says which environments have the info.
-    row
-        The index of the environment in the batch.
+    `infos` are the infos of the batch in Gymnasium's form: for each name an array, and under
+    "_name" a mask that says which environments have the info. `row` is the index of the
+    environment in the batch.
     """
     infos_of_one = {}
     for name, values in infos.items():

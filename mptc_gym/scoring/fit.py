@@ -38,13 +38,6 @@ def check_fit(policy: Any, plants: Plants) -> None:
     run in other processes. A controller with a method `check_environment` checks the plants by
     this method. For a model of Stable-Baselines3, the plants must have the spaces, the windows
     and the wrappers of the model's training.
-
-    Parameters
-    ----------
-    policy
-        A policy, as in `mptc_gym.evaluate`.
-    plants
-        A vector environment of Gymnasium in which the policy is to act.
     """
     for layer in layers(plants):
         if runs_processes(layer):
@@ -93,15 +86,8 @@ def _check_statistics(normaliser: Any) -> None:
 def _check_training(model: Any, plants: Plants) -> None:
     """Raise a ValueError if plants differ from those with which a model was trained.
 
-    Spaces are compared. Windows and wrappers are compared if the model still has the
-    environments of its training.
-
-    Parameters
-    ----------
-    model
-        A model of Stable-Baselines3, or the attribute `policy` of a model.
-    plants
-        A vector environment of Gymnasium in which the model is to act.
+    `model` is a model of Stable-Baselines3, or the attribute `policy` of a model. Windows and
+    wrappers are compared only if the model still has the environments of its training.
     """
     training = getattr(model, "env", None)
     # The list is empty if the environments of the training are in processes that are closed.
@@ -124,16 +110,9 @@ def _check_training(model: Any, plants: Plants) -> None:
 
 
 def _compare(name: str, of_training: Collection[Any], of_env: Collection[Any]) -> None:
-    """Raise a ValueError if environments differ from those of a model's training.
+    """Raise a ValueError if a property of a model's training and of `env` has other values.
 
-    Parameters
-    ----------
-    name
-        Name of the property that is compared, such as "action space".
-    of_training
-        The values that the property has in the environments of the training.
-    of_env
-        The values that the property has in the environments in which the model is to act.
+    `name` is the name of the property, such as "action space".
     """
     if of_training == of_env:
         return

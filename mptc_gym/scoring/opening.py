@@ -93,18 +93,9 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
 
 
 def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
-    """Return a vector environment with n plants from an id, a spec or a function.
+    """Return a vector environment with n plants, made by an id, a spec or a function `env`.
 
-    The function is called n times. A ValueError is raised if no environments can be made.
-
-    Parameters
-    ----------
-    env
-        An id, an `EnvSpec`, or a function that makes one environment.
-    n
-        Number of plants.
-    arguments
-        Further arguments of `gymnasium.make` for an id or a spec.
+    `arguments` are further arguments of `gymnasium.make` for an id or a spec.
     """
     if isinstance(env, str | EnvSpec):
         single = make_one(env, arguments)
@@ -131,11 +122,7 @@ def _sync_vector_env(environments: list[Env]) -> Plants:
 
 
 def _as_vector(env: Any) -> Plants:
-    """Return an environment of any kind as a vector environment of Gymnasium.
-
-    `env` is a single environment, a vector environment of Gymnasium, or a `VecEnv` of
-    Stable-Baselines3.
-    """
+    """Return an environment or a vector environment as a vector environment of Gymnasium."""
     if isinstance(env, VectorEnv):
         return env
     if not isinstance(env, gymnasium.Env):
@@ -148,13 +135,7 @@ def _as_vector(env: Any) -> Plants:
 
 
 class _FromVecEnv(VectorEnv[Any, Any, Any]):
-    """A `VecEnv` of Stable-Baselines3 as a vector environment of Gymnasium.
-
-    Parameters
-    ----------
-    venv
-        The `VecEnv`.
-    """
+    """A `VecEnv` of Stable-Baselines3 as a vector environment of Gymnasium."""
 
     def __init__(self, venv: Any) -> None:
         self.venv = venv
@@ -171,14 +152,8 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Reset all plants, and return observations and infos, both in arrays.
 
-        Parameters
-        ----------
-        seed
-            A list with a seed for each plant. Only a `GymnasiumVecEnv` takes all seeds. Another
-            `VecEnv` takes the first seed, and gives the integers that follow the first seed to
-            the other plants.
-        options
-            Not used.
+        `seed` is a list with a seed for each plant. Only a `GymnasiumVecEnv` takes all seeds.
+        Any other `VecEnv` takes the first seed, and gives the next integers to the next plants.
         """
         innermost = self.venv.unwrapped
         if hasattr(innermost, "set_seeds"):
@@ -191,8 +166,7 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all plants, and return observations, rewards, flags and infos, all in arrays.
 
-        `actions` has one row for each plant. The flags say which episodes have ended; all ended
-        episodes count as terminated, and none as truncated.
+        The flags say which episodes have ended. All ended episodes count as terminated.
         """
         observations, rewards, ended, infos = self.venv.step(actions)
         # A `GymnasiumVecEnv` fills its list of infos only where episodes end, and has the infos

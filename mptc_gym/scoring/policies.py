@@ -43,8 +43,7 @@ class Form(NamedTuple):
 def form_of(policy: Any) -> Form:
     """Return how a policy is called, and on which object.
 
-    A ValueError is raised if the policy is neither an object with `predict` or `act`, nor a
-    `torch.nn.Module`, nor a function.
+    A ValueError is raised if the policy has none of the four forms.
     """
     if is_environment(policy):
         reject("policy", policy, "a policy, which comes first: evaluate(policy, env)")
@@ -68,28 +67,11 @@ def form_of(policy: Any) -> Form:
 
 
 def start(policy: Any, n: int) -> Act:
-    """Reset a policy for an episode of each of n plants, and return its function.
+    """Reset a policy, and return it as a function for one episode of n plants.
 
-    `reset()` is called if the policy is an object with this method, or the bound method
-    `predict` or `act` of such an object.
-
-    Parameters
-    ----------
-    policy
-        A policy in one of the four forms.
-    n
-        Number of plants.
-
-    Returns
-    -------
-    function
-        Function of observations in NumPy arrays, with a row for each plant. The function
-        returns the actions of the policy, with a row for each plant.
-
-    Raises
-    ------
-    ValueError
-        If the policy has none of the four forms.
+    The function takes observations in NumPy arrays, and returns the actions of the policy, both
+    with a row for each plant. The method `reset()` is called if the policy is an object with
+    this method, or the bound method `predict` or `act` of an object with this method.
     """
     form = form_of(policy)
     reset = getattr(form.target, "reset", None)

@@ -38,12 +38,11 @@ def rollout(env: Any, act: Act, samples: int, seeds: list[int]) -> Iterator[Samp
     env
         A vector environment of Gymnasium with n plants.
     act
-        The policy, as a function of observations, one row for each plant, that returns actions,
-        one row for each plant.
+        The policy, as a function from observations to actions, both with a row for each plant.
     samples
         Number N of steps: N + 1 samples are yielded, k = 0, 1, ..., N.
     seeds
-        The n seeds of the episodes.
+        The seeds of the n episodes.
 
     Raises
     ------
@@ -106,23 +105,10 @@ def replayed(
 ) -> Iterator[Sample]:
     """Yield the samples of a rollout, and check that they belong to the seeds' episodes.
 
-    For the check, a `MiddlePointVectorEnv` with the arguments and seeds of the plants receives
-    the commands of the rollout: it must return the infos of the rollout.
-
-    Parameters
-    ----------
-    samples
-        The samples of the rollout.
-    parameters
-        The arguments of the plants.
-    seeds
-        The seed of each plant's episode.
-
-    Raises
-    ------
-    ValueError
-        If infos differ: the environment has reseeded, skipped samples, or changed the plant or
-        the infos.
+    For the check, a `MiddlePointVectorEnv` with the same arguments and seeds receives the
+    commands of the rollout. A ValueError is raised if its infos differ from those of the
+    rollout, because the environment of the rollout has reseeded, skipped samples, or changed
+    the plant or the infos.
     """
     plants = MiddlePointVectorEnv(len(seeds), **asdict(parameters))
     _, expected = plants.reset(seed=seeds)
