@@ -21,8 +21,9 @@ from mptc_gym.scoring.rollout import rollout
 SAMPLES = 1200  # length of an episode
 EPISODES = 100  # default number of episodes in a data set
 SEED = SEEDS["data sets"].first  # seed of the first episode of each data set
-EVALUATIONS = 50  # number of episodes to evaluate learners on; none of them is in the data
-# The controllers that collect the episodes of a data set, by the data set's behaviour. Several
+# Number of episodes on which learners are evaluated; no data set has one of these episodes.
+EVALUATION_EPISODES = 50
+# The controllers that collect the episodes of a data set, for each behaviour. Several
 # controllers take turns, episode by episode.
 BEHAVIOURS = {
     "pi": ("pi",),
@@ -33,13 +34,14 @@ BEHAVIOURS = {
 # predictor has another anti-windup, and the Smith predictor and the PI controller `pi-simc` are
 # tuned to an Ms (largest magnitude of the sensitivity function) of 1.6.
 VERSIONS = {"pi": 0, "smith": 1, "mixed": 1}
+# The preset and the behaviour of each data set.
 IDS = {
-    f"middlepoint/{plant}/{behaviour}-v{VERSIONS[behaviour]}": (plant, behaviour)
-    for plant in ("paper", "disturbed", "fouling")
+    f"middlepoint/{preset}/{behaviour}-v{VERSIONS[behaviour]}": (preset, behaviour)
+    for preset in ("paper", "disturbed", "fouling")
     for behaviour in BEHAVIOURS
 }
-VARIABLE = "MINARI_DATASETS_PATH"  # the environment variable with Minari's folder
-HOME = "~/.minari/datasets"  # Minari's folder if this variable is not set
+FOLDER_VARIABLE = "MINARI_DATASETS_PATH"  # the environment variable that names Minari's folder
+DEFAULT_FOLDER = "~/.minari/datasets"  # Minari's folder if the environment variable is not set
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class Episode:
 class Options:
     """Write offline data sets to Minari's folder.
 
-    Each includes the least possible error of its plant.
+    A data set includes the least possible error of its plant.
     """
 
     ids: Annotated[Names, Parameter(choices=IDS)] = field(default=(), kw_only=False)
@@ -68,20 +70,19 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Write data sets, print the mean errors of each, and return the closing message."""
-    root = out_folder(Path(os.environ.get(VARIABLE) or HOME).expanduser().absolute(), VARIABLE)
-    for name in dict.fromkeys(options.ids or IDS):
-        print(f"{name}: {write(root, name, options.episodes)}", flush=True)
+    """Write data sets, print the mean errors of each data set, and return a last message."""
+    folder = Path(os.environ.get(FOLDER_VARIABLE) or DEFAULT_FOLDER)
+    root = out_folder(folder.expanduser().absolute(), FOLDER_VARIABLE)
+    for dataset_id in dict.fromkeys(options.ids or IDS):  # without repeated ids
+        mean_errors = write(root, dataset_id, options.episodes)
+        print(f"{dataset_id}: {mean_errors}", flush=True)
     return f"The data sets are in {root}"
 
 
-def arguments_of(plant: str) -> dict[str, Any]:
-    """Return the arguments of the environment in which the data sets of a plant are collected.
-
-    `plant` is the name of a preset.
-    """
+def arguments_of(preset: str) -> dict[str, Any]:
+    """Return the arguments of the environment from which data sets of a preset are logged."""
     return {
-        **PRESETS[plant],
+        **PRESETS[preset],
         "setpoint": "random",
         "reward": "absolute",  # with `error_scale`, the reward is -|e|, degC
         "error_scale": 1.0,
@@ -91,37 +92,29 @@ def arguments_of(plant: str) -> dict[str, Any]:
     }
 
 
-def record(plant: str, behaviour: str, episodes: int = EPISODES) -> list[Episode]:
-    """Return logged episodes of a plant under some controllers, which take turns.
+def record(preset: str, behaviour: str, episodes: int = EPISODES) -> list[Episode]:
+    """Return logged episodes of a preset under the controllers of a behaviour.
 
-    Parameters
-    ----------
-    plant
-        Name of a preset.
-    behaviour
-        Key of `BEHAVIOURS`, which has the names of the controllers.
-    episodes
-        Number of episodes. Episode i has the seed `SEED + i`.
+    Episode i has the seed `SEED + i`.
     """
-    names = BEHAVIOURS[behaviour][:episodes]
+    controllers = BEHAVIOURS[behaviour][:episodes]
     recorded: list[Episode] = []
-    for turn, name in enumerate(names):
-        seeds = list(range(SEED + turn, SEED + episodes, len(names)))
-        recorded += _record_controller(plant, name, seeds)
+    for turn, controller in enumerate(controllers):
+        seeds = list(range(SEED + turn, SEED + episodes, len(controllers)))
+        recorded += _record_controller(preset, controller, seeds)
     return sorted(recorded, key=lambda episode: episode.seed)
 
 
-def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]:
-    """Return a logged episode of a plant under a controller for each seed.
+def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> list[Episode]:
+    """Return a logged episode of a preset under a controller for each seed.
 
-    The plants of all seeds are stepped together. `plant` is the name of a preset, and `name`
-    the name of a controller.
+    The plants of all seeds are stepped together.
     """
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.loop.rollout import make_plants
 
-    arguments = arguments_of(plant)
-    controller: Any = ROSTER[name].in_service(arguments, len(seeds), SEED)
+    arguments = arguments_of(preset)
+    controller: Any = ROSTER[controller_name].in_service(arguments, len(seeds), SEED)
     controller.reset()
     actions: list[NDArray[np.float32]] = []  # of each sample, shape (episodes, 1)
 
@@ -135,67 +128,61 @@ def _record_controller(plant: str, name: str, seeds: list[int]) -> list[Episode]
 
     plants = make_plants(len(seeds), SAMPLES, **arguments)
     samples = list(rollout(plants, act, SAMPLES, seeds))
-    observations_of_all = np.stack([sample.observations for sample in samples], axis=1)
-    actions_of_all = np.stack(actions, axis=1)
-    rewards_of_all = -np.abs([sample.infos["error"] for sample in samples[1:]]).T
+    observations = np.stack([sample.observations for sample in samples])
+    errors = np.array([sample.infos["error"] for sample in samples[1:]])
+    rewards = -np.abs(errors)
+    actions_of_all = np.stack(actions)
+    # Arrays have the shape (samples, episodes, ...).
     return [
-        Episode(name, seed, observations_of_all[i], actions_of_all[i], rewards_of_all[i])
+        Episode(controller_name, seed, observations[:, i], actions_of_all[:, i], rewards[:, i])
         for i, seed in enumerate(seeds)
     ]
 
 
-def write(root: Path, name: str, episodes: int) -> str:
+def write(root: Path, dataset_id: str, episodes: int) -> str:
     """Collect a data set, write it to Minari's folder, and return its mean errors as text.
 
-    The data set replaces an older data set of the same id. If the files cannot be written, an
-    `UnfinishedError` is raised, and no incomplete data set remains.
-
-    Parameters
-    ----------
-    root
-        Minari's folder.
-    name
-        The id of the data set, a key of `IDS`.
-    episodes
-        Number of episodes to collect.
+    The data set replaces an older data set of this id in Minari's folder `root`. If the files
+    cannot be written, an `UnfinishedError` is raised, and no incomplete data set remains.
     """
-    place = root / name
-    logged = record(*IDS[name], episodes)
+    destination = root / dataset_id
+    logged = record(*IDS[dataset_id], episodes)
     try:
         # Minari does not list the contents of hidden folders.
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as partial:
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as folder:
             # HDF5 crashes if the disk is full. A file as large as the data set is written and
             # removed first: on a full disk, this raises an OSError.
-            room = Path(partial, "room")
+            room = Path(folder, "room")
             room.write_bytes(bytes(1_000_000 + episodes * 250_000))
             room.unlink()
-            os.environ[VARIABLE] = partial  # Minari takes no folder as an argument
-            errors = _create(name, logged)
-            shutil.rmtree(place, ignore_errors=True)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            Path(partial, name).replace(place)
-    except OSError as fault:
-        raise UnfinishedError(f"{place} could not be written: {fault}") from fault
+            os.environ[FOLDER_VARIABLE] = folder  # Minari takes no folder as an argument
+            mean_errors = _create(dataset_id, logged)
+            shutil.rmtree(destination, ignore_errors=True)
+            destination.parent.mkdir(parents=True, exist_ok=True)
+            Path(folder, dataset_id).replace(destination)
+    except OSError as error:
+        raise UnfinishedError(f"{destination} could not be written: {error}") from error
     finally:
-        os.environ[VARIABLE] = str(root)
-    return errors
+        os.environ[FOLDER_VARIABLE] = str(root)
+    return mean_errors
 
 
-def _create(name: str, episodes: list[Episode]) -> str:
+def _create(dataset_id: str, episodes: list[Episode]) -> str:
     """Write logged episodes as a data set to Minari's folder; return mean errors as text.
 
-    Minari takes its folder from the environment variable `VARIABLE`. `name` is the id of the
-    data set, a key of `IDS`.
+    The environment variable `FOLDER_VARIABLE` names the folder.
     """
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    plant, behaviour = IDS[name]
-    arguments = arguments_of(plant)
+    preset, behaviour = IDS[dataset_id]
+    arguments = arguments_of(preset)
     idle = evaluate(
-        lambda observations: np.zeros((len(observations), 1)), episodes=EVALUATIONS, **arguments
+        lambda observations: np.zeros((len(observations), 1)),
+        episodes=EVALUATION_EPISODES,
+        **arguments,
     )
-    least_error = float(np.asarray(idle.least).mean())
+    assert idle.least_possible is not None  # the package has bounds of these plants
     mean_error = float(-np.mean([episode.rewards for episode in episodes]))
     buffers = [
         EpisodeBuffer(
@@ -210,23 +197,23 @@ def _create(name: str, episodes: list[Episode]) -> str:
     ]
     env = gymnasium.make("MiddlePoint-v0", max_episode_steps=SAMPLES, **arguments)
     dataset = minari.create_dataset_from_buffers(
-        name,
+        dataset_id,
         buffers,
         env=env,
         eval_env=env,
         algorithm_name=", ".join(BEHAVIOURS[behaviour]),
         author="The mptc_gym developers",
-        author_email="",  # Minari warns of None, here and in the next argument.
+        author_email="",  # Minari warns if this argument or the next one is None
         code_permalink="",
-        description=f"Preset {plant} with random set points. The reward is -|error| in degC.",
+        description=f"Preset {preset} with random set points. The reward is -|error| in degC.",
         ref_min_score=-idle.mean_error * SAMPLES,
-        ref_max_score=-least_error * SAMPLES,
-        num_episodes_average_score=EVALUATIONS,
+        ref_max_score=-idle.least_possible * SAMPLES,
+        num_episodes_average_score=EVALUATION_EPISODES,
         data_format="hdf5",
     )
     metadata = {
         "behaviour_error": mean_error,
-        "least_possible_error": least_error,
+        "least_possible_error": idle.least_possible,
         "idle_error": idle.mean_error,
         "evaluation_seeds": list(idle.seeds),
     }
@@ -234,7 +221,7 @@ def _create(name: str, episodes: list[Episode]) -> str:
     dataset.storage.update_metadata(metadata)
     dataset.storage.update_episode_metadata(controllers)
     return (
-        f"mean |e| {mean_error:.3f} °C, least possible {least_error:.3f}, "
+        f"mean |e| {mean_error:.3f} °C, least possible {idle.least_possible:.3f}, "
         f"idle valve {idle.mean_error:.3f}"
     )
 

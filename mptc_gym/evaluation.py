@@ -25,19 +25,19 @@ from mptc_gym.vector_env import MiddlePointVectorEnv
 
 Values = NDArray[np.float64]  # one number for each episode, shape (episodes,)
 
-# The seed of the first of the episodes behind published scores; episode i has the seed SEED +
-# i. The value is arbitrary, but never changes, so that scores stay comparable.
+# Seed of the first episode of a published score; the next episode has the next seed. The value
+# is arbitrary, but never changes, so that scores stay comparable.
 SEED: Final = 7_000_000
 EPISODES: Final = 100  # episodes of a published score
-# The seed of the first of the episodes for choosing among policies, which no published score
-# uses; episode i has the seed VALIDATION_SEED + i.
+# Seed of the first episode for choosing among policies. No published score uses the episodes
+# from this seed on.
 VALIDATION_SEED: Final = 5_000_000
-VALIDATION_EPISODES: Final = 200  # episodes for which the package has bounds
+VALIDATION_EPISODES: Final = 200  # episodes from `VALIDATION_SEED` on that have bounds
 SAMPLES: Final = 1200  # samples of an episode, unless the environment ends the episode earlier
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 # The arguments of an environment that change observations or rewards, but not the least
 # possible error of a controller.
-_NO_MATTER: Final = *WINDOWS, "reward", "error_scale", "move_weight"
+_WITHOUT_EFFECT_ON_BOUNDS: Final = *WINDOWS, "reward", "error_scale", "move_weight"
 _RESAMPLES: Final = 2000  # how often episodes are resampled for the bootstrap interval
 
 
@@ -52,20 +52,20 @@ class Evaluation:
     env : str
         The id of the environment, or the name of the class of an environment without an id.
     mean_error, travel : float
-        Means of `errors`, degC, and of `travels`, t/h, over all episodes.
-    errors, travels : ndarray, shape (episodes,)
-        For each episode, the mean error, that is the mean of |e(k)| over the samples k = 1 to
-        N, degC, with the error e of the temperature; and the valve travel, that is the sum of
-        the magnitudes of all changes of the applied flow, t/h.
+        Mean of `errors`, degC, and mean of `travels`, t/h.
+    errors : ndarray, shape (episodes,)
+        Mean error of each episode, degC: the mean of |e(k)| over the samples k = 1 to N, where
+        e is the error of the temperature.
+    travels : ndarray, shape (episodes,)
+        Valve travel of each episode, t/h: the sum of the magnitudes of all changes of the
+        applied flow.
     seeds : range
         Seeds of the episodes.
     note : str
-        Why there is no score, or why the score is 0, and what to do. The note is empty if there
-        is a score other than 0.
+        Why there is no score, or why the valve never moved, and what to do; otherwise "".
     least_possible : float or None
-        Least possible mean error of any controller, degC. `least_possible`, `multiple`,
-        `score`, `interval`, `least` and `scores` are None where the package has no bound:
-        `note` says why.
+        Least possible mean error of any controller, degC. This attribute and all that follow
+        are None if the package has no bound for the episodes; `note` says why.
     multiple : float or None
         `mean_error / least_possible`.
     score : float or None
@@ -73,7 +73,7 @@ class Evaluation:
     interval : (float, float) or None
         95 % bootstrap interval of the score, from resampled episodes.
     least, scores : ndarray or None, shape (episodes,)
-        Least possible mean error of each episode, degC, and score of each episode. Where only
+        Least possible mean error of each episode, degC, and score of each episode. If only
         noise and load are random, `least` is the expected value over noise and load.
     """
 
@@ -92,18 +92,20 @@ class Evaluation:
     scores: Values | None = None
 
     def __repr__(self) -> str:
-        parts = [f"{self.env}: mean error {self.mean_error:.3f} degC"]
+        mean_error = f"{self.env}: mean error {self.mean_error:.3f} degC"
+        score = ""
         if self.interval is not None:
+            mean_error += f", {self.multiple:.2f} times the least possible"
+            score = f"score {self.score:.3f}"
             low, high = self.interval
-            interval = f" (95 % {low:.3f} to {high:.3f})" if low < high else ""
-            parts[0] += f", {self.multiple:.2f} times the least possible"
-            parts.append(f"score {self.score:.3f}{interval}")
-        parts.append(f"valve travel {self.travel:.0f} t/h")
-        alike = ", all alike" if np.ptp(self.errors) == 0.0 else ""
-        parts.append(f"{len(self.errors)} episodes{alike}")
-        if self.note:
-            parts.append(self.note)
-        return "; ".join(parts)
+            if low < high:
+                score += f" (95 % {low:.3f} to {high:.3f})"
+        travel = f"valve travel {self.travel:.0f} t/h"
+        episodes = f"{len(self.errors)} episodes"
+        if np.ptp(self.errors) == 0.0:
+            episodes += ", all alike"
+        parts = [mean_error, score, travel, episodes, self.note]
+        return "; ".join(part for part in parts if part)
 
 
 def evaluate(
@@ -116,49 +118,45 @@ def evaluate(
 ) -> Evaluation:
     """Run a policy on fixed episodes and return errors, score and valve travel.
 
-    As with `evaluate_policy` of Stable-Baselines3, the policy acts in exactly the environments
-    that are passed as `env`: the windows of the observation, the wrappers, and the statistics
-    of wrappers that normalise must be those of the policy's training. The policy acts in a copy
-    of the environments, which themselves do not change. A training may therefore score its
-    model in the environments of the training.
+    The policy acts in a copy of exactly the environments that are passed as `env`. Windows of
+    the observation, wrappers, and the statistics of wrappers that normalise must be those of
+    the policy's training. The environments themselves do not change, so a training may score
+    its model in the environments of the training.
 
     Parameters
     ----------
     policy
         A policy has one of four forms:
 
-        - an object with `predict`, such as a model of Stable-Baselines3; `predict` receives
-          `state`, `episode_start` and `deterministic=True`, as far as `predict` has these
-          arguments;
+        - an object with `predict`, such as a model of Stable-Baselines3; the keywords `state`,
+          `episode_start` and `deterministic=True` are passed to `predict` if `predict` takes
+          them;
         - an object with `act`, such as a controller in `agents`; `act` takes observations,
           shape (n, size), and returns actions, shape (n, 1), in NumPy arrays;
         - a `torch.nn.Module`, or a method of a module; the module receives the observations in
-          a tensor of the type of the module's weights; meanwhile, the module is in evaluation
-          mode, and computes no gradients;
+          a tensor of the type of its weights, is in evaluation mode, and computes no gradients;
         - any other function of observations, shape (n, size), that returns actions, shape
           (n, 1), in NumPy arrays.
 
-        A bound method `predict` or `act` stands for the object of the method, and a
-        `functools.partial` for the function within the partial. If the policy has a method
-        `reset`, this method is called before each round of episodes. What a policy learns in an
-        evaluation stays with the policy.
+        A bound method `predict` or `act` stands for the object of the method. If the policy has
+        a method `reset`, this method is called before each round of episodes. What a policy
+        learns in an evaluation stays with the policy.
     env
         An id, such as one of `IDS`, or an `EnvSpec`; a function that makes one environment in
         each call; or environments: a single environment, a vector environment of Gymnasium, or
         a `VecEnv` of Stable-Baselines3, such as `model.get_env()`. If there are fewer
-        environments than `episodes`, the environments run several rounds.
+        environments than `episodes`, the environments run several rounds of episodes.
 
         Environments that cannot be copied, such as those in other processes or with a window,
-        are used themselves, and begin a new episode after the evaluation. A ValueError is
-        raised if the policy is a model that trains in environments that cannot be copied.
-        Original and copy share files that are opened by name, global random number generators,
-        and variables to which functions refer.
+        are used themselves, and begin a new episode after the evaluation. A copy shares with
+        its original the global random number generators, files that are opened by name, and
+        the variables outside a function that the function uses.
     episodes
         Number of episodes, at least 2. An episode has 1,200 samples, or fewer if the
         environment ends the episode earlier.
     seed
         Seed of the first episode; the next episode has the next seed. The default is the seed
-        of all published scores. To choose among policies, import `VALIDATION_SEED` from
+        of all published scores. To choose among policies, use `VALIDATION_SEED` of
         `mptc_gym.evaluation`: no published score uses the 200 episodes from this seed on.
     **arguments
         Further arguments for an id or a spec, as in `gymnasium.make`.
@@ -166,16 +164,16 @@ def evaluate(
     Returns
     -------
     Evaluation
-        Mean error, score and valve travel of the policy, over all episodes in numbers, and of
-        each episode in arrays of shape (episodes,).
+        Mean error, score and valve travel of the policy, over all episodes and of each episode.
 
     Raises
     ------
     ValueError
-        If the environment does not exist, is not of this package, or runs other episodes than
-        those that belong to the seeds; or if the policy or the policy's actions do not fit the
-        environment. If a model of Stable-Baselines3 still has the environments of its training,
-        `env` must have the windows of these environments, and wrappers of the same names.
+        If `env` does not exist, is not of this package, or runs other episodes than those of
+        the seeds; if the policy or the policy's actions do not fit `env`; if the policy is a
+        model of Stable-Baselines3 that still has the environments of its training, and `env`
+        has other windows or wrappers; or if the policy trains in environments that cannot be
+        copied.
 
     Examples
     --------
@@ -205,47 +203,35 @@ valve travel 10 t/h; 100 episodes, all alike
         if any(case_of(group.parameters) != case for group in groups):
             raise ValueError("env must have the same plants, but for windows and rewards")
         runs = _run(policy, plants, seeds, parameters)
-    bound = find_bound(case, runs.samples, seeds)
-    judged = {} if bound.least is None else _judge(runs.errors, bound.least, case, seeds)
-    notes = [bound.why_not, _why_idle(runs, parameters)]
-    return Evaluation(
+    bound = find_bound(case, runs.length, seeds)
+    notes = [bound.why_not, _why_idle(runs.travels, parameters)]
+    evaluation = Evaluation(
         env=groups[0].name,
         mean_error=float(runs.errors.mean()),
         travel=float(runs.travels.mean()),
         errors=runs.errors,
         travels=runs.travels,
         seeds=seeds,
-        note="; ".join(filter(None, notes)),
-        **judged,
+        note="; ".join(note for note in notes if note),
     )
+    if bound.least is None:
+        return evaluation
+    return _with_scores(evaluation, bound.least, _idle_errors(case, seeds))
 
 
 class _Runs(NamedTuple):
-    """Errors and valve travels of a policy's episodes, from which the score is computed."""
+    """Errors and valve travels of episodes that have the same length."""
 
     errors: Values  # mean of |e(k)| of each episode, degC, with e the error of the temperature
     travels: Values  # sum of the changes of the applied flow in each episode, t/h
-    samples: int  # number of samples N of each episode
+    length: int  # number of samples N of each episode
 
 
 def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _Runs:
     """Run an episode of a policy for each seed, in rounds of as many episodes as plants.
 
-    Parameters
-    ----------
-    policy
-        A policy, as in `evaluate`.
-    plants
-        A vector environment in which the policy acts.
-    seeds
-        The seeds of the episodes.
-    parameters
-        The arguments of the plants.
-
-    Raises
-    ------
-    ValueError
-        If episodes have different lengths, or if the episodes are not those of the seeds.
+    A ValueError is raised if episodes have different lengths, or if their noise, load or set
+    points are not those of the seeds.
     """
     n = plants.num_envs
     rounds: list[_Runs] = []
@@ -255,18 +241,18 @@ def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _
         if type(plants) is not MiddlePointVectorEnv:  # wrappers may change the episodes
             samples = replayed(samples, parameters, seeds_of_round)
         rounds.append(_measure(samples, n))
-        if rounds[-1].samples != rounds[0].samples:
-            _refuse_lengths(rounds[-1].samples)
+        if rounds[-1].length != rounds[0].length:
+            _refuse_lengths(rounds[-1].length)
     # The last round may have more episodes than are asked for.
     errors = np.hstack([runs.errors for runs in rounds])[: len(seeds)]
     travels = np.hstack([runs.travels for runs in rounds])[: len(seeds)]
-    return _Runs(errors, travels, rounds[0].samples)
+    return _Runs(errors, travels, rounds[0].length)
 
 
 def _measure(samples: Iterator[Sample], n: int) -> _Runs:
-    """Return errors and valve travels of n episodes, whose samples are `samples`.
+    """Return errors and valve travels of n plants from the samples of one episode.
 
-    A ValueError is raised if not all episodes end at the same sample.
+    A ValueError is raised if not all plants end the episode at the same sample.
     """
     next(samples)  # sample k = 0, which no policy has affected
     total_errors = np.zeros(n)
@@ -285,17 +271,17 @@ def _measure(samples: Iterator[Sample], n: int) -> _Runs:
     return _Runs(total_errors / length, travels, length)
 
 
-def _refuse_lengths(samples: int) -> NoReturn:
-    """Raise a ValueError: episodes differ in length, and one has `samples` samples."""
-    raise ValueError(f"env must end all episodes at once, got an end after {samples} samples")
+def _refuse_lengths(length: int) -> NoReturn:
+    """Raise a ValueError: episodes differ in length, and one of them has `length` samples."""
+    raise ValueError(f"env must end all episodes at once, got an end after {length} samples")
 
 
-def _why_idle(runs: _Runs, parameters: Parameters) -> str:
+def _why_idle(travels: Values, parameters: Parameters) -> str:
     """Return why the valve has never moved, and what helps; "" if the valve has moved.
 
-    `runs` are the results of the episodes, and `parameters` the arguments of the plants.
+    `travels` are the valve travels of the episodes, t/h.
     """
-    if runs.travels.any():
+    if travels.any():
         return ""
     low, high = parameters.range_of("dead_zone")
     if high == 0.0:
@@ -314,17 +300,10 @@ class Bound(NamedTuple):
     why_not: str = ""  # why `least` is None
 
 
-def find_bound(parameters: Parameters, samples: int, seeds: range) -> Bound:
+def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
     """Return the least possible mean error of each episode, or why the package has none.
 
-    Parameters
-    ----------
-    parameters
-        The arguments of the plants.
-    samples
-        Number of samples N of an episode.
-    seeds
-        The seeds of the episodes.
+    `length` is the number of samples of an episode, and each episode has one of the seeds.
     """
     least_by_seed = _read_bounds().get(case_of(parameters))
     if least_by_seed is None:
@@ -333,37 +312,36 @@ def find_bound(parameters: Parameters, samples: int, seeds: range) -> Bound:
             "bounds are kept for the presets alone, without other arguments of the plant; in a "
             "checkout, python -m benchmarks.bounds --help says how to compute others",
         )
-    if samples != SAMPLES:
+    if length != SAMPLES:
         return Bound(
             None,
-            f"bounds are kept for episodes of {SAMPLES:,} samples, not of {samples:,}: leave "
+            f"bounds are kept for episodes of {SAMPLES:,} samples, not of {length:,}: leave "
             "max_episode_steps as it is",
         )
     if len(least_by_seed[SEED]) == 1:  # one bound for all seeds: only noise and load are random
         return Bound(np.repeat(least_by_seed[SEED], len(seeds)))
-    ranges = []
+    seeds_with_bounds = []
     for first, least in least_by_seed.items():
         if first <= seeds.start and seeds.stop <= first + len(least):
             return Bound(least[seeds.start - first : seeds.stop - first])
-        ranges.append(f"{first:,} to {first + len(least) - 1:,}")
+        seeds_with_bounds.append(f"{first:,} to {first + len(least) - 1:,}")
     return Bound(
         None,
-        f"bounds of these plants are kept for seeds {' and '.join(ranges)}, not for "
+        f"bounds of these plants are kept for seeds {' and '.join(seeds_with_bounds)}, not for "
         f"{seeds.start:,} to {seeds.stop - 1:,}: choose seed and episodes among them",
     )
 
 
 @cache
 def _read_bounds() -> dict[Parameters, dict[int, Values]]:
-    """Return the bounds that `python -m benchmarks.bounds --package` wrote to `bounds.json`.
+    """Return all bounds of the package, which `python -m benchmarks.bounds --package` wrote.
 
     Returns
     -------
     dict of dict of ndarray
-        Least possible mean errors, degC. The outer key is the case: the arguments of the
-        plants, as `case_of` returns the arguments. The inner key is the seed of the first
-        episode: element i of the array belongs to this seed + i; an array of one element
-        belongs to all seeds.
+        Least possible mean errors, degC. The outer key is the case of the plants, as `case_of`
+        returns it. The inner key is the seed of the first episode: element i of the array
+        belongs to this seed + i. An array of one element belongs to all seeds.
     """
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
     bounds = {}
@@ -376,46 +354,45 @@ def _read_bounds() -> dict[Parameters, dict[int, Values]]:
 
 
 def case_of(parameters: Parameters) -> Parameters:
-    """Return arguments of plants, with defaults for those that do not affect the bound.
+    """Return arguments of plants, with defaults in place of those that change no bound.
 
     Plants of the same case have the same least possible errors.
     """
-    return replace(parameters, **{name: ARGUMENTS[name].default for name in _NO_MATTER})
+    defaults = {name: ARGUMENTS[name].default for name in _WITHOUT_EFFECT_ON_BOUNDS}
+    return replace(parameters, **defaults)
 
 
-def _judge(
-    errors: Values, least: Values, parameters: Parameters, seeds: range
-) -> dict[str, Any]:
-    """Return the fields of an `Evaluation` that compare errors with least possible errors.
-
-    Parameters
-    ----------
-    errors, least
-        Mean error and least possible mean error of each episode, degC, shape (episodes,).
-    parameters
-        The arguments of the plants.
-    seeds
-        The seeds of the episodes.
-    """
+def _idle_errors(parameters: Parameters, seeds: range) -> Values:
+    """Return the mean error of the episode of each seed if the valve never moves, degC."""
     n = len(seeds)
-    idle_plants = MiddlePointVectorEnv(n, **asdict(parameters))
+    plants = MiddlePointVectorEnv(n, **asdict(parameters))
     idle_action = action_from_command(0.0, parameters.u_min, parameters.u_max)
     idle_actions = np.full((n, 1), idle_action)
-    idle_samples = rollout(idle_plants, lambda _: idle_actions, SAMPLES, [*seeds])
-    idle_errors = _measure(idle_samples, n).errors
-    gained = idle_errors - errors
+    samples = rollout(plants, lambda _: idle_actions, SAMPLES, [*seeds])
+    return _measure(samples, n).errors
+
+
+def _with_scores(evaluation: Evaluation, least: Values, idle_errors: Values) -> Evaluation:
+    """Return an evaluation with the fields that need a bound, such as the score.
+
+    For each episode, `least` is the least possible mean error, and `idle_errors` is the mean
+    error if the valve never moves, both in degC.
+    """
+    gained = idle_errors - evaluation.errors
     possible = idle_errors - least
+    n = len(gained)
     generator = np.random.default_rng(0)
-    quotients = []
+    resampled_scores = []
     for _ in range(_RESAMPLES):
-        resample = generator.integers(n, size=n)
-        quotients.append(gained[resample].mean() / possible[resample].mean())
-    low, high = np.quantile(quotients, (0.025, 0.975)).tolist()
-    return {
-        "least_possible": float(least.mean()),
-        "multiple": float(errors.mean() / least.mean()),
-        "score": float(gained.mean() / possible.mean()),
-        "interval": (low, high),
-        "least": least,
-        "scores": gained / possible,
-    }
+        resample = generator.integers(n, size=n)  # numbers of episodes, drawn with replacement
+        resampled_scores.append(gained[resample].mean() / possible[resample].mean())
+    low, high = np.quantile(resampled_scores, (0.025, 0.975)).tolist()
+    return replace(
+        evaluation,
+        least_possible=float(least.mean()),
+        multiple=float(evaluation.errors.mean() / least.mean()),
+        score=float(gained.mean() / possible.mean()),
+        interval=(low, high),
+        least=least,
+        scores=gained / possible,
+    )

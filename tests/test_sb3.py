@@ -23,7 +23,7 @@ from mptc_gym import MiddlePointEnv, evaluate
 from mptc_gym import sb3 as ours
 from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.sb3 import ScoreCallback, load, make_vec_env, save, spec_of
-from mptc_gym.sb3.models import MEMBER
+from mptc_gym.sb3.models import SPEC_FILE
 from mptc_gym.wrappers import IncrementalAction
 
 HARD = "MiddlePointHard-v0"
@@ -117,6 +117,7 @@ class TestBatches:
         for message, arguments in {
             "n_envs must be an integer from 1": {"n_envs": 0},
             "group must be an integer from 1": {"group": 2},
+            "seed must be an integer from 0": {"seed": "a"},
             "env must be of this pack": {"env": DelayObservation(one(), delay=2).spec},
             "max_move must be": {"wrapper": {"max_move": 7}},
             "env must be the id of an environment": {"env": "Point-v0"},
@@ -180,7 +181,7 @@ class TestZips:
         model, file = model_of(make_vec_env(wrapper=VELOCITY)), tmp_path / "model.zip"
         save(model, file)
         with zipfile.ZipFile(file) as archive:
-            record = archive.read(MEMBER).decode()
+            record = archive.read(SPEC_FILE).decode()
         for edited, message in (
             ("{}", "KeyError"),
             (record.replace("PPO", "PPOO"), "AttributeError"),
@@ -190,7 +191,7 @@ class TestZips:
             model.save(file)
             if edited:
                 with zipfile.ZipFile(file, "a") as archive:
-                    archive.writestr(MEMBER, edited)
+                    archive.writestr(SPEC_FILE, edited)
             with pytest.raises(ValueError, match=message):
                 load(file)
         save(model, file)

@@ -31,29 +31,32 @@ LARGEST_MOVE = 0.4  # largest change of the action per sample; half the actuator
 # Number of past actions among the inputs: enough for all flows that have not yet shown in the
 # output, for the longest delay.
 MEMORY = 26
+NODES = 64  # nodes of the recurrent unit
 
 
 class Recurrent(nn.Module):
-    """The policy's network for n control loops: from set points and errors to actions.
+    """A recurrent policy for n control loops, which remembers its state and its past actions.
 
-    The state of the recurrent unit and the past actions are kept between samples.
-
-    Parameters
-    ----------
-    nodes
-        Number of nodes of the recurrent unit.
+    With the methods `reset` and `act`, the network is a policy for `mptc_gym.evaluate` and for
+    the command `benchmarks.compare`.
     """
 
-    def __init__(self, nodes: int = 64) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.cell = nn.GRUCell(2 + MEMORY, nodes)
-        self.output = nn.Linear(nodes + 2 + MEMORY, 1)
-        self.begin(1)
+        inputs = 2 + MEMORY  # set point, error and past actions
+        self.cell = nn.GRUCell(inputs, NODES)
+        self.output = nn.Linear(NODES + inputs, 1)
+        self.reset()
 
     def begin(self, n: int) -> None:
-        """Set state and past actions to 0 for n plants at rest, before a new episode."""
-        self.state = torch.zeros(n, self.cell.hidden_size)
+        """Set the state and the past actions to 0, for n plants at rest."""
+        self.state = torch.zeros(n, NODES)
         self.actions = torch.zeros(n, MEMORY)  # newest first
+        self.has_begun = True
+
+    def reset(self) -> None:
+        """Forget the episode: the next call of `act` begins a new episode."""
+        self.has_begun = False
 
     def detach(self) -> None:
         """Cut the PyTorch graph, so that later gradients do not reach earlier samples."""
@@ -73,38 +76,18 @@ class Recurrent(nn.Module):
         self.actions = torch.cat([action, self.actions[:, :-1]], dim=1)
         return action
 
-
-class Policy:
-    """A trained network as a policy with the methods `reset` and `act`.
-
-    `mptc_gym.evaluate` and the command `benchmarks.compare` accept such policies.
-
-    Parameters
-    ----------
-    network
-        The trained network.
-    """
-
-    def __init__(self, network: Recurrent) -> None:
-        self._network = network
-        self._begun = False
-
-    def reset(self) -> None:
-        """Prepare for a new episode: the next call of `act` resets the network's state."""
-        self._begun = False
-
     def act(self, observations: Any) -> np.ndarray[Any, Any]:
         """Return the actions of a sample, shape (n, 1).
 
-        `observations` has the shape (n, size): equal numbers of latest set points and latest
-        errors, degC, newest first.
+        `observations` is an array of shape (n, size): equal numbers of latest set points and
+        latest errors, degC, newest first.
         """
-        seen = torch.as_tensor(np.asarray(observations), dtype=torch.float32)
-        if not self._begun:
-            self._network.begin(len(seen))
-            self._begun = True
+        signals = torch.as_tensor(np.asarray(observations), dtype=torch.float32)
+        n, size = signals.shape
+        if not self.has_begun:
+            self.begin(n)
         with torch.no_grad():
-            actions = self._network(seen[:, 0], seen[:, seen.shape[1] // 2])
+            actions = self(setpoint=signals[:, 0], error=signals[:, size // 2])
         array: np.ndarray[Any, Any] = actions.numpy()
         return array
 
@@ -131,7 +114,7 @@ def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
         if step % (SAMPLES // SEGMENT) == 0:
             observations, _ = env.reset(seed=step)
             network.begin(plants)
-        # What was before this segment is constant: plants, network and observation.
+        # For the gradient, all that happened before this segment is constant.
         env.detach()
         network.detach()
         observations = observations.detach()
@@ -151,7 +134,7 @@ def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
     return network
 
 
-def make() -> Policy:
+def make() -> Recurrent:
     """Return the policy that is saved in `FILE`.
 
     The command `benchmarks.compare` calls this function for its option
@@ -159,7 +142,7 @@ def make() -> Policy:
     """
     network = Recurrent()
     network.load_state_dict(torch.load(FILE, weights_only=True))
-    return Policy(network)
+    return network
 
 
 if __name__ == "__main__":

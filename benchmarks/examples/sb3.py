@@ -8,12 +8,12 @@ This file can be copied without any other file; `benchmarks/train/ppo.py` import
 training works for the following reasons:
 
 - **Groups.** Eight plants have the same noise and set points, and differ only in the random
-  part of their actions. The mean over a group is subtracted from the advantages of its plants,
-  which makes the variance of the advantages much smaller.
+  part of their actions. From the advantage of each plant, the mean over its group is
+  subtracted, which makes the variance of the advantages much smaller.
 - **Changes as inputs.** The policy's inputs are the error, and changes of set point,
   temperature and flow, but not the values of set point, temperature and flow. The policy has no
-  biases. So the policy keeps the flow constant only if the error is 0, which means no steady
-  error, and behaves in the same way at temperatures of -5 degC and +5 degC.
+  biases. So the policy keeps the flow constant only if the error is 0: there is no steady
+  error. And the policy behaves in the same way at temperatures of -5 degC and +5 degC.
 - **Less and less exploration.** The standard deviation of the actions falls by a schedule. A
   standard deviation that is learnt stays too high.
 - **Changes of the flow as actions.** The action changes the flow (wrapper `IncrementalAction`,
@@ -61,7 +61,7 @@ PLANTS: dict[str, Any] = {
 
 
 def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
-    """Return the inputs of the networks: the error, and changes of the other signals.
+    """Return the inputs of the networks: the error, and changes of the three other signals.
 
     Parameters
     ----------
@@ -69,7 +69,8 @@ def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
         Observations of the environment, shape (n, size): latest set points, errors, outputs and
         actions, in this order, each newest first.
     windows
-        The numbers of set points, errors, outputs and actions in an observation, in this order.
+        The numbers of set points, errors (one), outputs and actions in an observation, in this
+        order.
 
     Returns
     -------
@@ -111,19 +112,14 @@ def changes(window: Tensor, single: int) -> Tensor:
 
 
 class Changes(BaseFeaturesExtractor):
-    """The feature extractor that computes the inputs of policy and value function by `inputs`.
+    """The inputs of policy and value function, computed by `inputs`, as a feature extractor."""
 
-    Parameters
-    ----------
-    space
-        The observation space.
-    """
-
-    def __init__(self, space: Any) -> None:
-        super().__init__(space, features_dim=49)
+    def __init__(self, observation_space: Any) -> None:
+        # An error, and 2, 12 and 34 changes of set point, output and action.
+        super().__init__(observation_space, features_dim=49)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Return the inputs of the networks for observations of shape (n, size), (n, 49)."""
+        """Return the inputs, shape (n, 49), for observations of shape (n, size)."""
         return inputs(observations, WINDOWS)
 
 
@@ -134,12 +130,9 @@ class GroupBuffer(RolloutBuffer):
     """
 
     def compute_returns_and_advantage(self, last_values: Tensor, dones: Any) -> None:
-        """Compute returns and advantages, and subtract the groups' means from the advantages.
-
-        The arguments are those of `RolloutBuffer`: the values of the observations after the
-        last sample, and whether the episodes ended there.
-        """
+        """Compute returns and advantages, and subtract the group's mean from each advantage."""
         super().compute_returns_and_advantage(last_values, dones)
+        # A view: the subtraction changes `self.advantages`, shape (samples, plants).
         groups = self.advantages.reshape(self.buffer_size, -1, GROUP)
         groups -= groups.mean(axis=2, keepdims=True)
 
@@ -152,10 +145,8 @@ class Exploration(BaseCallback):
 
     Parameters
     ----------
-    first
-        The natural logarithm at the start of the training.
-    last
-        The natural logarithm at the end of the training.
+    first, last
+        The natural logarithm at the start and at the end of the training.
     """
 
     def __init__(self, first: float, last: float) -> None:
@@ -164,7 +155,7 @@ class Exploration(BaseCallback):
         self._last = last
 
     def _on_step(self) -> bool:
-        return True
+        return True  # go on with the training
 
     def _on_rollout_start(self) -> None:
         progress = self.num_timesteps / self.locals["total_timesteps"]
@@ -172,8 +163,8 @@ class Exploration(BaseCallback):
         log_std.data.fill_(self._first + progress * (self._last - self._first))
 
 
-def make_ppo(plants: VecEnv, seed: int, **policy: Any) -> PPO:
-    """Return an untrained PPO model whose policy has no biases.
+def make_ppo(plants: VecEnv, seed: int, **policy_arguments: Any) -> PPO:
+    """Return an untrained model of PPO whose policy has no biases.
 
     Parameters
     ----------
@@ -181,7 +172,7 @@ def make_ppo(plants: VecEnv, seed: int, **policy: Any) -> PPO:
         The training plants, in groups of `GROUP`.
     seed
         Seed of the initial weights, the exploration and the plants.
-    **policy
+    **policy_arguments
         Arguments of the policy's class, `policy_kwargs` of Stable-Baselines3.
     """
     model = PPO(
@@ -191,7 +182,7 @@ def make_ppo(plants: VecEnv, seed: int, **policy: Any) -> PPO:
         # update nothing remains; the lower bound lets this update have an effect.
         learning_rate=lambda remaining: 2e-3 * max(remaining, 0.05),
         rollout_buffer_class=GroupBuffer,
-        policy_kwargs=policy,
+        policy_kwargs=policy_arguments,
         seed=seed,
         device="cpu",
         **SETTINGS,
@@ -213,9 +204,9 @@ def main() -> None:
 
     torch.set_num_threads(1)  # the networks are too small for more
     plants = make_vec_env("MiddlePoint-v0", 512, group=GROUP, **PLANTS)
-    linear = {"pi": [], "vf": [64, 64]}  # the policy; the value function has two layers
-    model = make_ppo(plants, options.seed, features_extractor_class=Changes, net_arch=linear)
-    model.learn(options.steps, Exploration(-1.2, -4.0))
+    layers = {"pi": [], "vf": [64, 64]}  # a linear policy; a value function of two layers
+    model = make_ppo(plants, options.seed, features_extractor_class=Changes, net_arch=layers)
+    model.learn(options.steps, Exploration(first=-1.2, last=-4.0))
     save(model, options.out / f"ppo-{options.seed}.zip")
     for env in ("MiddlePoint-v0", "MiddlePointNoisy-v0"):
         print(evaluate(model, spec_of(model, env)))

@@ -2,8 +2,8 @@
 
     python -m benchmarks.examples.stock ppo --seed 0 --minutes 4 --out curves.csv
 
-The algorithm has its default settings, except those in `ALGORITHMS`. Every quarter of the time,
-the policy is scored on 100 validation episodes, and a row is added to the CSV file.
+An algorithm has its default settings, except those in `TRAININGS`. The policy is scored four
+times during its training, and each score becomes a row of the CSV file.
 `benchmarks/published/stock_curves.csv` has five seeds of each algorithm.
 """
 
@@ -11,7 +11,7 @@ import argparse
 import csv
 import time
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import torch
 from sb3_contrib import RecurrentPPO
@@ -27,63 +27,72 @@ SCORES: Final = 4  # number of scores in a training, at equal intervals of proce
 # Arguments of the environment that determine the observation: the set point, eight errors, and
 # past actions over a time that is longer than the longest delay.
 WINDOWS: Final = {"setpoint_window": 1, "error_window": 8, "action_window": 31}
-# For each algorithm its class, the number of plants that are simulated together, and arguments
-# of the class that differ from its defaults.
-ALGORITHMS: Final[dict[str, tuple[Any, int, dict[str, Any]]]] = {
-    "ppo": (PPO, 64, {"n_steps": 64, "batch_size": 1024}),
-    "recurrent-ppo": (RecurrentPPO, 64, {"n_steps": 64, "batch_size": 1024}),
-    "sac": (SAC, 16, {"gradient_steps": 2}),
-    "td3": (TD3, 16, {"gradient_steps": 2}),
+
+
+class Training(NamedTuple):
+    """How an algorithm trains a policy."""
+
+    algorithm: Any  # class of the algorithm
+    policy: str  # name of the policy's class
+    plants: int  # number of plants that are simulated together
+    settings: dict[str, Any]  # arguments of the algorithm's class that are not defaults
+
+
+TRAININGS: Final = {
+    "ppo": Training(PPO, "MlpPolicy", 64, {"n_steps": 64, "batch_size": 1024}),
+    "recurrent-ppo": Training(
+        RecurrentPPO, "MlpLstmPolicy", 64, {"n_steps": 64, "batch_size": 1024}
+    ),
+    "sac": Training(SAC, "MlpPolicy", 16, {"gradient_steps": 2}),
+    "td3": Training(TD3, "MlpPolicy", 16, {"gradient_steps": 2}),
 }
-POLICIES: Final = {"recurrent-ppo": "MlpLstmPolicy"}  # the others have "MlpPolicy"
 
 
 class Curve(BaseCallback):
-    """A callback that scores a policy during its training, at equal intervals of time.
+    """Write the learning curve of a training to a CSV file, and then stop the training.
 
-    After the last score, the callback stops the training.
+    The curve has `SCORES` points, at equal intervals of the training's processor time. The time
+    that the scores take does not count.
 
     Parameters
     ----------
     seconds
-        Processor time of the training, without the time for the scores, s.
-    row
-        Values for the first columns of each row in the CSV file, by column.
+        Processor time of the training, s.
+    labels
+        Values for the first columns of each row, by column.
     path
-        The CSV file, to which a row is appended for each score.
+        The CSV file, to which rows are appended.
     """
 
-    def __init__(self, seconds: float, row: dict[str, Any], path: Path) -> None:
+    def __init__(self, seconds: float, labels: dict[str, Any], path: Path) -> None:
         super().__init__()
-        self._seconds = seconds
-        self._row = row
+        self._labels = labels
         self._path = path
-        self._scores = 0
-        self._began = time.process_time()
+        self._due_times = [seconds * point / SCORES for point in range(1, SCORES + 1)]
+        self._start_time = time.process_time()
+        self._scoring_seconds = 0.0  # processor time of all scores so far
 
     def _on_step(self) -> bool:
-        """Score the policy if it is time, and return whether to go on with the training."""
-        spent = time.process_time() - self._began
-        if spent < self._seconds * (self._scores + 1) / SCORES:
-            return True
-        self._score(spent)
-        self._began = time.process_time() - spent  # as a score is no part of the training
-        return self._scores < SCORES
+        """Score the policy if a score is due; return whether another score is to come."""
+        training_seconds = time.process_time() - self._start_time - self._scoring_seconds
+        if training_seconds >= self._due_times[0]:
+            del self._due_times[0]
+            before = time.process_time()
+            self._append_score(training_seconds)
+            self._scoring_seconds += time.process_time() - before
+        return bool(self._due_times)
 
-    def _score(self, spent: float) -> None:
-        """Score the policy on validation episodes, and append a row to the CSV file.
-
-        `spent` is the processor time of the training so far, s.
-        """
-        self._scores += 1
+    def _append_score(self, training_seconds: float) -> None:
+        """Score the policy on validation episodes, and append a row to the CSV file."""
         spec = spec_of(self.model, IDS["hard"])
         result = evaluate(self.model, spec, episodes=EPISODES, seed=VALIDATION_SEED)
+        assert result.score is not None  # the package has bounds of validation episodes
         row = {
-            **self._row,
+            **self._labels,
             "samples": self.num_timesteps,
-            "cpu_seconds": round(spent),
+            "cpu_seconds": round(training_seconds),
             "mean_error": round(result.mean_error, 4),
-            "score": round(result.score or 0.0, 4),
+            "score": round(result.score, 4),
             "travel": round(result.travel),
         }
         is_new = not self._path.exists()
@@ -95,45 +104,32 @@ class Curve(BaseCallback):
         print(row, flush=True)
 
 
-def train(algorithm: str, seed: int, minutes: float, path: Path) -> None:
-    """Train a policy for some processor time, and append its scores to a CSV file.
+def main() -> None:
+    """Train a policy as the command line says, and write its learning curve."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("algorithm", choices=TRAININGS)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=4.0)
+    parser.add_argument("--out", type=Path, default=Path("curves.csv"))
+    options = parser.parse_args()
 
-    Parameters
-    ----------
-    algorithm
-        Key of `ALGORITHMS`.
-    seed
-        Seed of the initial weights, the exploration and the plants.
-    minutes
-        Processor time of the training, without the time for the scores.
-    path
-        The CSV file.
-    """
-    kind, n, settings = ALGORITHMS[algorithm]
+    torch.set_num_threads(1)  # the networks are too small for more
+    training = TRAININGS[options.algorithm]
     plants = make_vec_env(
         IDS["hard"],
-        n,
-        seed=seed,
+        training.plants,
+        seed=options.seed,
         wrapper={"max_move": 2.0},
         reward="absolute",
         **WINDOWS,
     )
-    policy = POLICIES.get(algorithm, "MlpPolicy")
-    model = kind(policy, plants, seed=seed, device="cpu", **settings)
-    row = {"algorithm": algorithm, "seed": seed}
-    model.learn(10**9, callback=Curve(60.0 * minutes, row, path))
-
-
-def main() -> None:
-    """Read the command line, and train a policy."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("algorithm", choices=ALGORITHMS)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--minutes", type=float, default=4.0)
-    parser.add_argument("--out", type=Path, default=Path("curves.csv"))
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)  # the networks are too small for more
-    train(arguments.algorithm, arguments.seed, arguments.minutes, arguments.out)
+    model = training.algorithm(
+        training.policy, plants, seed=options.seed, device="cpu", **training.settings
+    )
+    labels = {"algorithm": options.algorithm, "seed": options.seed}
+    curve = Curve(60.0 * options.minutes, labels, options.out)
+    no_limit = 10**9  # samples of experience: the callback ends the training
+    model.learn(no_limit, callback=curve)
 
 
 if __name__ == "__main__":

@@ -22,16 +22,16 @@ WINDOWS: Any = {
     "action_window": 24,
 }
 SETPOINTS: Any = {"setpoint": "random", "setpoint_amplitude": 6.0, "setpoint_period": 400}
-# Constant action that keeps the temperature at 1 degC in steady state: the plant's gain is
-# -0.6825 degC per t/h, and an action of 1 is a flow of 10 t/h.
-HOLDS = -0.1465
+# Action that keeps the temperature at 1 degC in steady state: the plant's gain is -0.6825 degC
+# per t/h, and an action of 1 is a flow of 10 t/h.
+STEADY_ACTION = -0.1465
 
 
 def act(network: nn.Module, observations: Tensor) -> Tensor:
     """Return the actions of the policy for n plants, shape (n, 1).
 
-    An action is the constant action for the set point plus the network's output. All inputs of
-    the network are 0 if the output has been at the set point in steady state for 24 samples.
+    An action is the steady action for the set point plus the network's output. All inputs of
+    the network are 0 if the plant has been in steady state at the set point for 24 samples.
 
     Parameters
     ----------
@@ -41,13 +41,14 @@ def act(network: nn.Module, observations: Tensor) -> Tensor:
         The set point, 24 outputs and 24 actions of each plant, shape (n, 49).
     """
     setpoint, outputs, actions = observations.split([1, 24, 24], dim=1)
-    inputs = torch.cat([0.5 * (setpoint - outputs), actions - HOLDS * setpoint], dim=1)
-    action: Tensor = HOLDS * setpoint + network(inputs)
+    steady_action = STEADY_ACTION * setpoint
+    errors = 0.5 * (setpoint - outputs)  # in units of 2 degC, to be of order 1
+    action: Tensor = steady_action + network(torch.cat([errors, actions - steady_action], 1))
     return action
 
 
 def run(network: nn.Module, plants: MiddlePointTorchEnv, samples: int, seed: int) -> Tensor:
-    """Run the policy on n plants from rest, and return the errors, degC, shape (samples, n).
+    """Run the policy on n plants, and return the errors, degC, shape (samples, n).
 
     Parameters
     ----------

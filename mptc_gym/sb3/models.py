@@ -1,11 +1,4 @@
-"""Train with Stable-Baselines3 on a batch of plants, and save models with their spec.
-
-    plants = make_vec_env("MiddlePoint-v0", 64, seed=0, wrapper={"compensate_dead_zone": True},
-                          action_window=20, setpoint="random")
-    model = PPO("MlpPolicy", plants, n_steps=64).learn(200_000, ScoreCallback(path="best.zip"))
-
-Requires `pip install "mptc_gym[sb3]"`.
-"""
+"""Save and load models of Stable-Baselines3 with their environments, and score trainings."""
 
 from __future__ import annotations
 
@@ -30,38 +23,35 @@ from mptc_gym.environments.layers import is_environment, layers, plant_groups
 from mptc_gym.environments.making import make_batch, make_one
 from mptc_gym.evaluation import VALIDATION_SEED, WINDOWS, Evaluation, evaluate
 from mptc_gym.plant.checks import MOST_PLANTS, count, reject
-from mptc_gym.sb3.vec_env import GymnasiumVecEnv, make_vec_env
+from mptc_gym.sb3.vec_env import make_vec_env
 from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.fit import check_fit
 from mptc_gym.scoring.opening import opened
 
-__all__ = ["GymnasiumVecEnv", "ScoreCallback", "load", "make_vec_env", "save", "spec_of"]
-
-MEMBER = "mptc_gym.json"  # name of the file that `save` adds to the zip of a model
+SPEC_FILE = "mptc_gym.json"  # name of the file that `save` adds to the zip of a model
 
 
 def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any) -> EnvSpec:
-    """Return the spec of an id or spec with the windows and wrappers of a model's environments.
+    """Return the spec of an environment with the windows and wrappers of a model's training.
 
-    The result is for `evaluate`, as in::
+    The spec is for `evaluate`, as in::
 
         evaluate(model, spec_of(model, "MiddlePointHard-v0"))
-
-    A spec does not hold wrappers of Stable-Baselines3, such as `VecNormalize`.
 
     Parameters
     ----------
     policy
         A model of Stable-Baselines3 with the environments of its training.
-    env, **arguments
-        An id or an `EnvSpec`, and further arguments for the environment, as in
-        `gymnasium.make`.
+    env
+        An id or an `EnvSpec`.
+    **arguments
+        Further arguments for the environment, as in `gymnasium.make`.
 
     Returns
     -------
     EnvSpec
-        The spec of `env`, in which the window sizes of the observation and the wrappers of
-        Gymnasium are those of the model's environments.
+        The spec of `env` with the window sizes and the wrappers of Gymnasium of the model's
+        environments. A spec holds no wrappers of Stable-Baselines3, such as `VecNormalize`.
 
     Raises
     ------
@@ -69,15 +59,14 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
         If the model has no environments, or if these environments cannot be made from their
         spec.
     """
-    spec_of_training = _spec(policy)
-    windows = plant_groups(policy.get_env())[0].parameters.windows
-    arguments = {**dict(zip(WINDOWS, windows, strict=True)), **arguments}
-    spec = cast("EnvSpec", make_one(env, arguments).spec)
-    wrappers = spec_of_training.additional_wrappers
+    wrappers = _spec_of_training(policy).additional_wrappers
+    window_sizes = plant_groups(policy.get_env())[0].parameters.windows
+    windows = dict(zip(WINDOWS, window_sizes, strict=True))
+    spec = cast("EnvSpec", make_one(env, {**windows, **arguments}).spec)
     return dataclasses.replace(spec, additional_wrappers=wrappers)
 
 
-def _spec(model: Any) -> EnvSpec:
+def _spec_of_training(model: Any) -> EnvSpec:
     """Return the spec of the first environment of a model, without the `Monitor` around it.
 
     A ValueError is raised if the model has no environments, or if `gymnasium.make` cannot make
@@ -91,7 +80,7 @@ def _spec(model: Any) -> EnvSpec:
             wrapper for wrapper in spec.additional_wrappers if wrapper.name != "Monitor"
         ]
         spec = dataclasses.replace(spec, additional_wrappers=tuple(wrappers))
-        gymnasium.make(EnvSpec.from_json(spec.to_json()))
+        gymnasium.make(EnvSpec.from_json(spec.to_json()))  # a trial, also of the text form
     except Exception as error:  # whatever a wrapper of another package raises
         raise ValueError(
             "policy must be a model with its environments (see mptc_gym.sb3.load), which must "
@@ -123,9 +112,10 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
         cannot be written.
     """
     path = _zip_path(path)
-    spec = _spec(model)
+    spec = _spec_of_training(model)
     plants = cast("VecEnv", model.get_env())
-    if isinstance(plants, VecEnvWrapper) or len({*map(str, plants.get_attr("spec"))}) > 1:
+    different_specs = set(map(str, plants.get_attr("spec")))
+    if isinstance(plants, VecEnvWrapper) or len(different_specs) > 1:
         raise ValueError(
             "policy must have environments that do not differ, in no VecEnvWrapper, to be "
             f"saved here, got {type(plants).__name__}: save it by model.save(path), and "
@@ -139,7 +129,7 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
             complete = Path(folder, "model.zip")
             model.save(complete)
             with zipfile.ZipFile(complete, "a") as archive:
-                archive.writestr(MEMBER, record)
+                archive.writestr(SPEC_FILE, record)
             complete.replace(path)
     except OSError as error:
         raise ValueError(f"{path} cannot be written: {error.strerror}") from error
@@ -173,10 +163,11 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
         raise ValueError(f"path must be an existing file, got {path}")
     try:
         with zipfile.ZipFile(path) as archive:
-            record = json.loads(archive.read(MEMBER))
+            record = json.loads(archive.read(SPEC_FILE))
             n_envs = json.loads(archive.read("data"))["n_envs"]
         algorithm = pkgutil.resolve_name(record["algorithm"])
         spec = EnvSpec.from_json(record["spec"])
+        # Only plants in no wrapper other than IncrementalAction can be stepped together.
         if make_batch(gymnasium.make(spec), 1) is None:
             plants: VecEnv = DummyVecEnv([partial(gymnasium.make, spec)] * n_envs)
         else:
@@ -202,19 +193,19 @@ def _zip_path(path: str | Path) -> Path:
 class ScoreCallback(BaseCallback):
     """Score the policy during a training, without exploration, and keep the best policy.
 
-    The episodes of a score have seeds from `VALIDATION_SEED` of `mptc_gym.evaluation` on, which
-    no published score uses. Where nothing is random, as in `MiddlePoint-v0`, all episodes are
-    the same: choose another set point than that of published scores, such as
-    `setpoint_period=500`. The logger of the model records `score/mean_error`, degC, and, where
-    the package has a bound of the mean error, `score/score`.
+    The scored episodes have seeds from `VALIDATION_SEED` of `mptc_gym.evaluation` on, which no
+    published score uses. In `MiddlePoint-v0`, nothing is random, so the seeds do not matter:
+    choose a set point of your own for the scores, such as `setpoint_period=500`. The logger of
+    the model records `score/mean_error`, degC, and, where the package has a bound of the mean
+    error, `score/score`.
 
     Parameters
     ----------
-    env, **arguments
-        The environments of a score, as in `mptc_gym.evaluate`; `env` may also be the
-        environment of the training. If `env` is an id or a spec, the scored environments get
-        the windows and wrappers of the training: see `spec_of`. If `env` is in a
-        `VecNormalize`, the policy acts in a copy of `env` with the statistics of the training.
+    env
+        The environments in which the policy is scored, as in `mptc_gym.evaluate`; the training
+        environments are allowed. Environments of an id or a spec get the windows and wrappers
+        of the training, as by `spec_of`. Environments in a `VecNormalize` get the statistics
+        that the training has at the time of a score.
     every
         Samples of experience between two scores, summed over all plants. The last score is at
         the end of the training.
@@ -226,6 +217,8 @@ class ScoreCallback(BaseCallback):
         file. A ValueError is raised if the file exists before the first training.
     verbose
         1 prints each score, 0 does not.
+    **arguments
+        Further arguments for an id or a spec, as in `gymnasium.make`.
 
     Attributes
     ----------
@@ -261,7 +254,8 @@ class ScoreCallback(BaseCallback):
         Stable-Baselines3 calls this method at the start of each `learn`. A ValueError is raised
         if `path` exists or cannot be written, or if the environments do not fit the model.
         """
-        self._latest = self.model.num_timesteps  # samples of experience at the latest score
+        # Samples of experience at the latest score, or at the start of the training.
+        self._samples_at_score = self.model.num_timesteps
         if self.path is not None:
             if self.path.exists() and not self._has_saved:
                 allowed = "a file that does not exist yet, as it would be overwritten"
@@ -274,15 +268,17 @@ class ScoreCallback(BaseCallback):
             check_fit(self.model, plants)
 
     def _environment(self) -> tuple[Any, dict[str, Any]]:
-        """Return the environments of a score and further arguments, both for `evaluate`.
+        """Return the argument `env` of `evaluate` for a score, and further arguments.
 
-        Copies of a `VecNormalize` have the statistics that the training has at present.
+        If `env` is in a `VecNormalize`, a copy is returned, which has the statistics that the
+        training has at present.
         """
         if isinstance(self._env, str | EnvSpec):
             return spec_of(self.model, self._env, **self._arguments), {}
         if not is_environment(self._env):
             return self._env, self._arguments
         env = Copy(self._env).env
+        # Further wrappers of either environment stay as they are.
         pairs = zip(_normalisers(env), _normalisers(self.training_env), strict=False)
         for of_copy, of_training in pairs:
             of_copy.ret_rms = copy.deepcopy(of_training.ret_rms)
@@ -291,19 +287,19 @@ class ScoreCallback(BaseCallback):
         return env, self._arguments
 
     def _on_step(self) -> bool:
-        """Score the policy if `every` samples have passed, and return True to go on."""
-        if self.num_timesteps >= self._latest + self.every:
+        """Score the policy if `every` samples have passed; return True to go on training."""
+        if self.num_timesteps >= self._samples_at_score + self.every:
             self._score()
         return True
 
     def _on_training_end(self) -> None:
         """Score the policy once more, unless there is a score of the present policy."""
-        if self.num_timesteps > self._latest:
+        if self.num_timesteps > self._samples_at_score:
             self._score()
 
     def _score(self) -> None:
         """Score the present policy, record and print the result, and keep the best policy."""
-        self._latest = self.num_timesteps
+        self._samples_at_score = self.num_timesteps
         env, arguments = self._environment()
         result = evaluate(
             self.model, env, episodes=self.episodes, seed=VALIDATION_SEED, **arguments
@@ -319,7 +315,7 @@ class ScoreCallback(BaseCallback):
                 save(self.model, self.path)
                 self._has_saved = True
         if self.verbose:
-            total = self.locals.get("total_timesteps", self.num_timesteps)
+            total = self.locals["total_timesteps"]  # of the training
             mark = "; best" if is_best else ""
             print(f"{self.num_timesteps:,} of {total:,} samples: {result}{mark}", flush=True)
 

@@ -25,14 +25,13 @@ class GymnasiumVecEnv(VecEnv):
 
     All methods return bit for bit what a `DummyVecEnv` returns with the same environments, each
     in a `Monitor`, except for infos: `step` returns an empty info for an environment whose
-    episode goes on, as making a dict for each environment would take longer than the step. The
-    attribute `infos` holds the infos of all environments in Gymnasium's form, as arrays.
+    episode goes on, as a dict for each environment would take longer than the step.
 
     Parameters
     ----------
     *batches
-        Vector environments of autoreset mode "SameStep" and with the same spaces. Their
-        environments are numbered one batch after another.
+        Vector environments of Gymnasium with autoreset mode "SameStep" and with the same
+        spaces. Environments are numbered through all batches, in the order of the batches.
     spec
         The spec of one environment with its wrappers, if all environments are alike.
     group
@@ -54,13 +53,13 @@ class GymnasiumVecEnv(VecEnv):
         self.spec = spec
         self.group = group
         self.infos: dict[str, Any] = {}
-        self._slices: list[slice] = []  # the numbers of the environments of each batch
+        self._slices: list[slice] = []  # of the numbers of each batch's environments
         num_envs = 0
         for batch in batches:
             self._slices.append(slice(num_envs, num_envs + batch.num_envs))
             num_envs += batch.num_envs
-        self._next_seeds: list[int | None] = [None] * num_envs
-        # Sum of rewards and number of samples of each environment's episode so far.
+        self._next_seeds: list[int | None] = [None] * num_envs  # None: no new seed
+        # Sum of rewards and number of samples in the present episode of each environment.
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, np.int64)
         super().__init__(
@@ -70,9 +69,9 @@ class GymnasiumVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set and return the seeds of the next reset: environment i has `seed + i // group`.
 
-        If `seed` is None, a random seed takes its place.
+        None stands for a random seed.
         """
-        first = cast("int", super().seed(seed)[0])  # a random seed if `seed` is None
+        first = cast("int", super().seed(seed)[0])  # which replaces None by a random seed
         seeds = [first + index // self.group for index in range(self.num_envs)]
         self.set_seeds(seeds)
         return seeds
@@ -84,8 +83,8 @@ class GymnasiumVecEnv(VecEnv):
     def reset(self) -> NDArray[Any]:
         """Reset all environments, and return the observations, shape (num_envs, size).
 
-        The seeds are those that `seed` or `set_seeds` has set since the latest reset. Without
-        such seeds, the random numbers continue.
+        If neither `seed` nor `set_seeds` has set seeds since the latest reset, the sequences of
+        random numbers continue.
         """
         returned = [
             batch.reset(seed=self._next_seeds[numbers])
@@ -94,7 +93,7 @@ class GymnasiumVecEnv(VecEnv):
         self._next_seeds = [None] * self.num_envs
         self._returns[:] = 0.0
         self._lengths[:] = 0
-        observations, infos = zip(*returned, strict=True)
+        observations, infos = zip(*returned, strict=True)  # each has an element for each batch
         self.infos = _joined(infos)
         self.reset_infos = []
         for infos_of_batch, batch in zip(infos, self.batches, strict=True):
@@ -126,6 +125,7 @@ class GymnasiumVecEnv(VecEnv):
             batch.step(self._actions[numbers])
             for batch, numbers in zip(self.batches, self._slices, strict=True)
         ]
+        # Each array of a batch is joined with the arrays of other batches.
         *arrays, batch_infos = zip(*returned, strict=True)
         observations, rewards, terminated, truncated = map(np.concatenate, arrays)
         self.infos = _joined(batch_infos)
@@ -151,7 +151,7 @@ class GymnasiumVecEnv(VecEnv):
         return observations, rewards.astype(np.float32), ended, infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
-        """Return a picture of each environment, if the batches render; otherwise []."""
+        """Return a picture of each environment; [] if the batches do not render."""
         images: list[NDArray[np.uint8]] = []
         for batch in self.batches:
             images += batch.render() or ()
@@ -163,39 +163,37 @@ class GymnasiumVecEnv(VecEnv):
             batch.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return the value of the attribute `attr_name` for each environment in `indices`.
+        """Return the value of an attribute for each environment in `indices`.
 
-        The value is that of the environment's batch. The attribute "spec" is the spec of one
-        environment. `indices` is an index, several indices, or None for all environments.
+        The attribute "spec" is the spec of one environment. Any other attribute is that of the
+        environment's batch. `indices` is an index, several indices, or None for all.
         """
-        values = [self.spec] * self.num_envs
-        if attr_name != "spec":
-            values = []
-            for batch in self.batches:
-                values += [getattr(batch, attr_name)] * batch.num_envs
+        values: list[Any] = []
+        for batch in self.batches:
+            value = self.spec if attr_name == "spec" else getattr(batch, attr_name)
+            values += [value] * batch.num_envs
         return [values[index] for index in self._get_indices(indices)]
 
     def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise a NotImplementedError: no environment of a batch has methods of its own."""
-        raise NotImplementedError(f"use `batches`, for all at once, got {args or kwargs}")
+        raise NotImplementedError(
+            "use `batches`, as an environment of a batch has no methods of its own, got "
+            f"{args or kwargs}"
+        )
 
     set_attr = env_method
 
     def env_is_wrapped(
         self, wrapper_class: type[Any], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return False for each environment in `indices`: in a batch, none is wrapped.
-
-        `indices` is an index, several indices, or None for all environments. `wrapper_class`
-        does not matter.
-        """
+        """Return False for each environment in `indices`: a batch has no wrappers inside."""
         return [False for _ in self._get_indices(indices)]
 
 
 def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
-    """Return the arrays that the infos of all batches have, concatenated, by name.
+    """Return infos of all environments by name, in arrays of shape (num_envs,).
 
-    `infos` holds the infos of each batch.
+    `infos` holds the infos of each batch. Infos that a batch lacks are left out.
     """
     common_names = set(infos[0]).intersection(*infos[1:])
     joined = {}
@@ -208,13 +206,15 @@ def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
 def _infos_of_one(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
     """Return the info that one environment of a batch would return if it were alone.
 
-    `infos` are the infos of the batch, in arrays, and `row` is the index of the environment in
-    the batch.
+    `infos` are the infos of the batch in Gymnasium's form: for each name an array, and under
+    "_name" a mask that says which environments have the info. `row` is the index of the
+    environment in the batch.
     """
     infos_of_one = {}
     for name, values in infos.items():
-        is_of_plant = not name.startswith("final_") and f"_{name}" in infos
-        if is_of_plant and infos[f"_{name}"][row]:
+        mask = infos.get(f"_{name}")
+        # "final_obs" and "final_info" belong to the batch, not to an environment.
+        if mask is not None and mask[row] and not name.startswith("final_"):
             value = values[row]
             infos_of_one[name] = value.item() if isinstance(value, np.generic) else value
     return infos_of_one
@@ -233,9 +233,8 @@ def make_vec_env(
 
     Parameters
     ----------
-    env, **arguments
-        An id or an `EnvSpec`, and further arguments of `gymnasium.make` for the environment.
-        `render_mode` may be "rgb_array".
+    env
+        An id or an `EnvSpec`.
     n_envs
         Number of plants.
     seed
@@ -248,22 +247,29 @@ def make_vec_env(
         The arguments of an `IncrementalAction` to wrap the plants in, or the class
         `IncrementalAction` for its default arguments; None for no wrapper. Other wrappers
         cannot wrap a batch: use `stable_baselines3.common.env_util.make_vec_env`.
+    **arguments
+        Further arguments for the plants, as in `gymnasium.make`. `render_mode` may be
+        "rgb_array".
 
     Raises
     ------
     ValueError
-        If `env` is not of this package, or an argument is out of range.
+        If `env` is not of this package, if it has other wrappers, or if an argument is out of
+        range.
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
+    if seed is not None:
+        seed = count("seed", seed, 0, 2**63)
     render_mode = arguments.pop("render_mode", None)  # for the batch, but not for its spec
     single = make_one(env, arguments)
     if isinstance(wrapper, Mapping):
         single = IncrementalAction(single, **wrapper)
     elif wrapper is not None:
         single = wrapper(single)
-    mode = AutoresetMode.SAME_STEP
-    batch = make_batch(single, n_envs, autoreset_mode=mode, render_mode=render_mode)
+    batch = make_batch(
+        single, n_envs, autoreset_mode=AutoresetMode.SAME_STEP, render_mode=render_mode
+    )
     if batch is None:
         reject("env", single, "of this package, in no wrapper other than IncrementalAction")
     plants = GymnasiumVecEnv(batch, spec=single.spec, group=group)

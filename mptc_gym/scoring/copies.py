@@ -1,7 +1,7 @@
 """Copy environments layer by layer, so that a policy can act in a copy.
 
 A layer is one environment object in a nesting: a wrapper, a vector environment or an innermost
-environment. `copy.deepcopy` alone is not enough: this function fails for files and for most
+environment. `copy.deepcopy` alone is not enough: `deepcopy` fails for files and for most
 wrappers of Stable-Baselines3, loses what a `VecNormalize` wraps, and closes the pipes of
 environments in other processes.
 """
@@ -26,28 +26,27 @@ from mptc_gym.environments.layers import (
     runs_processes,
 )
 
-# The classes of layers that record episodes and change neither observations nor actions: a copy
-# of an environment is made without these layers.
+# The classes of wrappers that record episodes and change neither observations nor actions: the
+# copy of an environment is without these wrappers.
 _RECORDERS: Final = (
     "gymnasium.wrappers.RecordVideo",
     "gymnasium.wrappers.vector.RecordVideo",
     "minari.DataCollector",
     f"{VEC_ENV}.VecVideoRecorder",
 )
-# The classes of the ends of pipes; on Windows, some ends are of a class that other systems
-# lack.
-_PIPES: Final[tuple[Any, ...]] = (
+# The classes of a pipe's ends. Only Windows has the class `PipeConnection`.
+_PIPE_ENDS: Final[set[Any]] = {
     connection.Connection,
     getattr(connection, "PipeConnection", connection.Connection),
-)
+}
 
 
 class Copy:
-    """A copy of an environment and all environments within, also in mid-episode.
+    """A copy of an environment and all environments within it, at their present samples.
 
-    The original environment stays as it is. The copy writes to no file of the original, and
-    closes nothing. Layers that run in other processes, show a window, hold a pipe, or cannot be
-    copied for another reason are not copied: copy and original share these layers.
+    The copy writes to no file of the original, and closes nothing. Layers that run in other
+    processes, show a window, or raise an error when they are copied are not copied: copy and
+    original share these layers and all layers within them.
 
     Parameters
     ----------
@@ -67,30 +66,64 @@ class Copy:
     def __init__(self, env: Any) -> None:
         self.shared: dict[int, Any] = {}
         self.reason = ""
-        self._memo: dict[int, Any] = {}  # of `copy.deepcopy`: copies by the `id` of originals
+        # The argument `memo` of `copy.deepcopy`: each copy by the `id` of its original.
+        # `deepcopy` takes the copies in `memo` instead of copying their originals again.
+        self._copies: dict[int, Any] = {}
         with _pipes_refused():
             self.env = self._copy(env)
 
     def _copy(self, layer: Any) -> Any:
-        """Return a copy of a layer and its inner layers, or the layer if that is impossible."""
-        if id(layer) in self._memo:
-            return self._memo[id(layer)]
-        for inner in inner_environments(layer):
-            self._copy(inner)
-        reason = _why_not(layer)
+        """Return a copy of a layer and its inner layers; the layer itself if it is shared."""
+        if id(layer) in self._copies:
+            return self._copies[id(layer)]
+        copies_of_inner = [self._copy(inner) for inner in inner_environments(layer)]
+        if isinstance(layer, tuple(map(loaded, _RECORDERS))):
+            self._copies[id(layer)] = copies_of_inner[0]
+            return copies_of_inner[0]
+        reason = _why_not_copied(layer)
         if not reason:
-            memo_before = dict(self._memo)
+            copies_before = dict(self._copies)
             try:
-                return _copy_layer(layer, self._memo)
+                return self._copy_alone(layer)
             except Exception as error:  # whatever a layer of another package raises
                 reason = f"{type(layer).__name__} cannot be copied: {error}"
-                self._memo.clear()  # forget the parts of the copy that failed
-                self._memo.update(memo_before)
+                self._copies.clear()  # forget the parts of the copy that failed
+                self._copies.update(copies_before)
         self.reason = reason
         for original in layers(layer):
             self.shared[id(original)] = original
-            self._memo[id(original)] = original
+            self._copies[id(original)] = original
         return layer
+
+    def _copy_alone(self, layer: Any) -> Any:
+        """Return a copy of a layer, around the copies of its inner layers in `_copies`."""
+        if inner_environments(layer):
+            duplicate = self._copy_attributes(layer)
+        else:
+            duplicate = copy.deepcopy(layer, self._copies)
+        if isinstance(duplicate, VectorEnv):
+            duplicate.closed = True  # as a vector environment closes itself when it is deleted
+        return duplicate
+
+    def _copy_attributes(self, wrapper: Any) -> Any:
+        """Return a copy of a wrapper or a vector environment, attribute by attribute.
+
+        The methods by which wrappers are pickled do not serve: a pickled `VecNormalize` lacks
+        the environment that it wraps.
+        """
+        duplicate = object.__new__(type(wrapper))
+        self._copies[id(wrapper)] = duplicate
+        attributes = dict(vars(wrapper))
+        if "results_writer" in attributes:
+            attributes["results_writer"] = None  # so that the copy of a monitor writes no file
+        if "class_attributes" in attributes:  # of a VecEnvWrapper; what is in it has no copies
+            class_attributes = attributes["class_attributes"]
+            self._copies[id(class_attributes)] = class_attributes
+        # The inner environments come first: a wrapper looks in them for what it lacks itself.
+        inner_names = [name for name in INNER if name in attributes]
+        for name in [*inner_names, *attributes]:
+            vars(duplicate)[name] = copy.deepcopy(attributes[name], self._copies)
+        return duplicate
 
 
 @contextmanager
@@ -99,15 +132,15 @@ def _pipes_refused() -> Iterator[None]:
 
     Without the context, the copy of a pipe closes the original pipe when the copy is deleted.
     """
-    before = dict(copyreg.dispatch_table)
-    for pipe in _PIPES:
-        copyreg.pickle(pipe, _refuse_pipe)
+    table = copyreg.dispatch_table  # how `copy` and `pickle` treat objects, by class
+    treatments_before = dict(table)
+    table.update(dict.fromkeys(_PIPE_ENDS, _refuse_pipe))
     try:
         yield
     finally:
-        for pipe in set(_PIPES):
-            del copyreg.dispatch_table[pipe]
-        copyreg.dispatch_table.update(before)
+        for pipe_end in _PIPE_ENDS:
+            del table[pipe_end]
+        table.update(treatments_before)
 
 
 def _refuse_pipe(_: Any) -> NoReturn:
@@ -115,45 +148,14 @@ def _refuse_pipe(_: Any) -> NoReturn:
     raise TypeError("a pipe to another process cannot be copied")
 
 
-def _why_not(layer: Any) -> str:
-    """Return why an environment or wrapper must not be copied; "" if a copy may be tried."""
+def _why_not_copied(layer: Any) -> str:
+    """Return why a copy of a layer must not even be tried; "" if a copy may be tried."""
     name = type(layer).__name__
     if runs_processes(layer):
         return f"{name} runs in other processes"
+    # Wrappers around an environment with a window report its render mode "human" as theirs.
     inner = inner_environments(layer)
     inner_modes = [getattr(environment, "render_mode", None) for environment in inner]
-    # A wrapper around an environment that shows a window also has the render mode "human".
     if getattr(layer, "render_mode", None) == "human" and "human" not in inner_modes:
         return f"{name} shows a window"
     return ""
-
-
-def _copy_layer(layer: Any, memo: dict[int, Any]) -> Any:
-    """Return a copy of a layer whose inner layers have been copied before.
-
-    `memo` holds the copies so far by the `id` of the originals, as for `copy.deepcopy`. If the
-    layer only records episodes, the copy of the layer within it is returned.
-    """
-    if isinstance(layer, tuple(map(loaded, _RECORDERS))):
-        (inner,) = inner_environments(layer)
-        memo[id(layer)] = memo[id(inner)]
-        return memo[id(layer)]
-    if not inner_environments(layer):
-        duplicate = copy.deepcopy(layer, memo)
-    else:
-        # Wrappers define how they are pickled, but a pickled VecNormalize loses what it wraps.
-        duplicate = object.__new__(type(layer))
-        memo[id(layer)] = duplicate
-        attributes = dict(vars(layer))
-        if "results_writer" in attributes:
-            attributes["results_writer"] = None  # so that a copy of a monitor writes no file
-        if "class_attributes" in attributes:  # of a VecEnvWrapper, shared by its class
-            memo[id(layer.class_attributes)] = layer.class_attributes
-        for name in INNER:  # first, as a wrapper looks up other attributes in what it wraps
-            if name in attributes:
-                vars(duplicate)[name] = copy.deepcopy(attributes[name], memo)
-        for name, value in attributes.items():
-            vars(duplicate)[name] = copy.deepcopy(value, memo)
-    if isinstance(duplicate, VectorEnv):
-        duplicate.closed = True  # so that a deleted copy closes nothing
-    return duplicate

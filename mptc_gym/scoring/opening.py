@@ -27,11 +27,12 @@ from mptc_gym.environments.making import Env, make_batch, make_one
 from mptc_gym.plant.checks import reject
 from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.policies import form_of
-from mptc_gym.scoring.rollout import in_columns
+from mptc_gym.scoring.rollout import infos_in_arrays
 
 _POLICY_OF_A_MODEL: Final = "stable_baselines3.common.policies.BaseModel"
 
-# A vector environment of Gymnasium. `VectorEnv` as its type does not allow a list of seeds.
+# A vector environment of Gymnasium. It has no type `VectorEnv` here, as the method `reset` of
+# this type takes no list of seeds.
 Plants = Any
 
 
@@ -44,10 +45,9 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
     Parameters
     ----------
     env
-        As in `mptc_gym.evaluate`. If `env` is an environment, the vector environment holds a
-        copy of this environment. Environments that cannot be copied are used themselves, and
-        begin a new episode at the end of the context. If `env` is an id, a spec or a function,
-        the environments that are made are closed at the end of the context.
+        As in `mptc_gym.evaluate`. From an id, a spec or a function, environments are made,
+        which are closed at the end of the context. Environments are copied; those that cannot
+        be copied are used themselves, and begin a new episode at the end of the context.
     n
         Number of plants to make, if `env` is an id, a spec or a function.
     policy
@@ -77,33 +77,32 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
             copy = Copy(env)
             _refuse_training_environments(copy, target)
             plants = _as_vector(copy.env)
-            acts_itself = bool(copy.shared)
+            originals_act = bool(copy.shared)
         else:
             plants = _make(env, n, arguments)
-            acts_itself = False
+            originals_act = False
             stack.callback(plants.close)
         if not plant_groups(plants):
             allowed = "of MiddlePointEnv in NumPy, and open, such as an id or a spec of it"
             reject("env", env, allowed)
-        if acts_itself:  # the originals of some layers act, within copies of other layers
-            stack.enter_context(_frozen(env))
+        if originals_act:  # in layers that could not be copied, within copies of other layers
+            stack.enter_context(_statistics_frozen(env))
             stack.callback(_as_vector(env).reset, seed=_next_seeds(plants))
-        stack.enter_context(_frozen(plants))
+        stack.enter_context(_statistics_frozen(plants))
         yield plants
 
 
 def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
-    """Return n plants from an id or a spec, or from n calls of a function, as one environment.
+    """Return a vector environment with n plants, made by an id, a spec or a function `env`.
 
-    `env` is the id, the spec or the function, and `arguments` are further arguments of an id or
-    a spec. A ValueError is raised if no environments can be made.
+    `arguments` are further arguments of `gymnasium.make` for an id or a spec.
     """
     if isinstance(env, str | EnvSpec):
         single = make_one(env, arguments)
         batch = make_batch(single, n)
-        if batch is None:
-            return _in_turn([single, *(make_one(env, arguments) for _ in range(n - 1))])
-        return batch
+        if batch is not None:
+            return batch
+        return _sync_vector_env([single, *(make_one(env, arguments) for _ in range(n - 1))])
     if not callable(env):
         allowed = "an id, an EnvSpec, environments, or a function that makes one"
         reject("env", env, f"{allowed} (a model that was loaded has no environments)")
@@ -112,25 +111,23 @@ def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
         if not isinstance(environment, gymnasium.Env):
             allowed = "a function that makes one environment; where it makes many, call it"
             reject("env", environment, allowed)
-    return _in_turn(environments)
+    return _sync_vector_env(environments)
 
 
-def _in_turn(environments: list[Env]) -> Plants:
+def _sync_vector_env(environments: list[Env]) -> Plants:
     """Return a vector environment that steps the given environments one after another."""
+    # SyncVectorEnv takes functions that make environments. The default argument keeps the
+    # environment of each function.
     return SyncVectorEnv([lambda env=env: env for env in environments])  # type: ignore[misc]
 
 
 def _as_vector(env: Any) -> Plants:
-    """Return an environment of any kind, as a vector environment of Gymnasium.
-
-    `env` is a single environment, a vector environment of Gymnasium, or a `VecEnv` of
-    Stable-Baselines3.
-    """
+    """Return an environment or a vector environment as a vector environment of Gymnasium."""
     if isinstance(env, VectorEnv):
         return env
     if not isinstance(env, gymnasium.Env):
         return _FromVecEnv(env)
-    plants = _in_turn([env])
+    plants = _sync_vector_env([env])
     # Some versions of Gymnasium close the environments within a vector environment when the
     # vector environment is deleted, unless it is closed.
     plants.closed = True
@@ -138,13 +135,7 @@ def _as_vector(env: Any) -> Plants:
 
 
 class _FromVecEnv(VectorEnv[Any, Any, Any]):
-    """A `VecEnv` of Stable-Baselines3 as a vector environment of Gymnasium.
-
-    Parameters
-    ----------
-    venv
-        The `VecEnv`.
-    """
+    """A `VecEnv` of Stable-Baselines3 as a vector environment of Gymnasium."""
 
     def __init__(self, venv: Any) -> None:
         self.venv = venv
@@ -155,20 +146,14 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
 
     @property
     def np_random_seed(self) -> Any:
-        """The latest seed of each plant, in a list, as each environment reports its seed."""
+        """A list of the latest seed of each plant."""
         return self.venv.get_attr("np_random_seed")
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Reset all plants, and return observations and infos, both in arrays.
 
-        Parameters
-        ----------
-        seed
-            A list with a seed for each plant. Only a `GymnasiumVecEnv` takes all seeds. Another
-            `VecEnv` takes the first seed, and gives the integers that follow the first seed to
-            the other plants.
-        options
-            Not used.
+        `seed` is a list with a seed for each plant. Only a `GymnasiumVecEnv` takes all seeds.
+        Any other `VecEnv` takes the first seed, and gives the next integers to the next plants.
         """
         innermost = self.venv.unwrapped
         if hasattr(innermost, "set_seeds"):
@@ -176,32 +161,32 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
         else:
             self.venv.seed(seed[0])
         observations = self.venv.reset()
-        return observations, {**in_columns(innermost.reset_infos)}
+        return observations, {**infos_in_arrays(innermost.reset_infos)}
 
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all plants, and return observations, rewards, flags and infos, all in arrays.
 
-        `actions` has one row for each plant. The flags say which episodes have ended; all ended
-        episodes count as terminated.
+        The flags say which episodes have ended. All ended episodes count as terminated.
         """
         observations, rewards, ended, infos = self.venv.step(actions)
-        # A `GymnasiumVecEnv` fills its list of infos only where episodes end.
-        columns = in_columns(infos) or getattr(self.venv.unwrapped, "infos", {})
-        return observations, rewards, ended, np.zeros_like(ended), {**columns}
+        # A `GymnasiumVecEnv` fills its list of infos only where episodes end, and has the infos
+        # of all plants in its attribute `infos`.
+        arrays = infos_in_arrays(infos) or getattr(self.venv.unwrapped, "infos", {})
+        return observations, rewards, ended, np.zeros_like(ended), {**arrays}
 
 
 def _refuse_training_environments(copy: Copy, target: Any) -> None:
-    """Raise a ValueError if `target`, a policy, may train in layers that a copy shares.
+    """Raise a ValueError if a policy may train in layers that copy and original share.
 
-    The `policy` of a model of Stable-Baselines3 does not know the environments of the model, so
-    it may train in any.
+    `target` is the model or another object behind the policy. The attribute `policy` of a model
+    of Stable-Baselines3 does not know the model's environments, so it may train in any.
     """
     training = getattr(target, "env", None)
     trains_there = is_environment(training) and any(
         id(layer) in copy.shared for layer in layers(training)
     )
-    is_part_of_a_model = isinstance(target, loaded(_POLICY_OF_A_MODEL))
-    if trains_there or (copy.shared and is_part_of_a_model):
+    is_policy_of_a_model = isinstance(target, loaded(_POLICY_OF_A_MODEL))
+    if trains_there or (copy.shared and is_policy_of_a_model):
         raise ValueError(
             "env must not be the training environments of policy, as these cannot be copied "
             f"({copy.reason}): make others like them, and pass the model itself, or use "
@@ -212,23 +197,24 @@ def _refuse_training_environments(copy: Copy, target: Any) -> None:
 def _next_seeds(plants: Plants) -> list[int]:
     """Return a seed for a new episode of each plant, computed from the present seeds.
 
-    With these seeds, the environments of a user do not go on with the episodes of a score, and
-    a user who seeds the environments can repeat a program.
+    With these seeds, the environments of a user do not go on with the episodes of a score. The
+    seeds are not random, so that a user can repeat a program.
     """
-    present = np.ravel(plants.unwrapped.np_random_seed).tolist()
-    # A negative number is Gymnasium's value for a seed that Gymnasium does not know.
-    entropy = [abs(seed) for seed in present if seed is not None]
+    present_seeds = np.ravel(plants.unwrapped.np_random_seed).tolist()
+    # A SeedSequence takes no negative number, which is Gymnasium's value for an unknown seed.
+    entropy = [abs(seed) for seed in present_seeds if seed is not None]
     seeds: list[int] = np.random.SeedSequence(entropy).generate_state(plants.num_envs).tolist()
     return seeds
 
 
 @contextmanager
-def _frozen(env: Any) -> Iterator[None]:
+def _statistics_frozen(env: Any) -> Iterator[None]:
     """Return a context in which no wrapper of an environment updates its statistics."""
     with ExitStack() as stack:
         for layer in layers(env):
-            flag = normaliser_flag(layer)
+            flag = normaliser_flag(layer)  # name of an attribute; "" if there are no statistics
             if flag:
+                # Put the present value back at the end of the context.
                 stack.callback(setattr, layer, flag, getattr(layer, flag))
                 setattr(layer, flag, False)
         yield
