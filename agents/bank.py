@@ -12,6 +12,7 @@ time constants, n), for n plants.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -28,25 +29,26 @@ NOISE_COLOUR: Final = (-0.3574, -0.03392)  # coefficients of the polynomial C fr
 
 # Settings of the identification, with which the control error was smallest on random plants.
 # Forgetting factor of the gains, per sample: a gain can drift within 1,000 samples.
-GAIN_MEMORY: Final = 0.999
-# Forgetting factor of the log-likelihoods, per sample: nearer to 1, as a delay does not drift.
-MODEL_MEMORY: Final = 0.9995
-# Factor of the log-likelihoods. It is below 1, as one-step errors are slightly correlated.
-CAUTION: Final = 0.5
+GAIN_FORGETTING: Final = 0.999
+# Forgetting factor of the models' log-likelihoods, per sample: nearer to 1 than that of the
+# gains, as a delay does not drift.
+MODEL_FORGETTING: Final = 0.9995
+# Factor of log-likelihoods. It is below 1, as one-step errors are slightly correlated.
+LIKELIHOOD_FACTOR: Final = 0.5
 # Zero of the whitening filter. Nearer to 1, a load disturbs the estimates of gains less.
 LOAD_POLE: Final = 0.98
 # Standard deviation of the one-step errors that is expected at first, of the authority.
 FIRST_NOISE: Final = 0.07
 FIRST_NOISE_SAMPLES: Final = 30.0  # number of samples that `FIRST_NOISE` counts for
-NOISE_RATE: Final = 0.004  # least weight of the newest squared error in the noise variance
+LEAST_NOISE_RATE: Final = 0.004  # least weight of the newest error in the noise variance
 # Least standard deviation of the noise, of the authority. Smaller errors of the models would
 # come from their low order and not from noise.
 LEAST_NOISE: Final = 0.003
 # A squared error is limited to this multiple of the variance, so that an outlier counts little.
-OUTLIER: Final = 16.0
-GAINS: Final = (0.3, 3.0)  # least and greatest gain, as multiples of the step test's
+LARGEST_SQUARE: Final = 16.0
+GAIN_LIMITS: Final = (0.3, 3.0)  # least and greatest gain, as multiples of the step test's
 # Least logarithm of a probability, relative to the most probable model: exp(-30) is nearly 0.
-UNLIKELY: Final = -30.0
+LEAST_LOGARITHM: Final = -30.0
 # Samples between updates of the models' probabilities, which take the most computing time.
 DESIGN_INTERVAL: Final = 2
 LAGS: Final = 4  # number of latest outputs and of latest mean model outputs that a bank keeps
@@ -70,6 +72,11 @@ class Prior:
     gain_spread: ArrayLike
     """Standard deviation of the plant's gain before the first sample, as a share of the step
     test's gain, shape (n,)."""
+
+    def of_plants(self, n: int) -> Prior:
+        """Return the prior knowledge of n equal plants; `self` is that of one plant."""
+        repeated = {name: np.repeat(values, n, axis=-1) for name, values in vars(self).items()}
+        return Prior(**repeated)
 
 
 @dataclass(frozen=True)
@@ -102,13 +109,53 @@ def second_order(time_constants: Array) -> tuple[Array, Array, Array, Array]:
     """Return a1, a2, b1 and b2 of s(k) = a1 s(k-1) + a2 s(k-2) + b1 f(k-1) + b2 f(k-2).
 
     The equation is a model with the flow f as its input, the output s, a gain of 1 and no
-    delay. Its fast pole, and the ratio b1 / b2, are those of equation (28) of the paper.
-    `time_constants` are in samples, and the four arrays have the same shape.
+    delay. The model's fast pole, and the ratio b1 / b2, are those of equation (28) of the
+    paper. `time_constants` are in samples, and the four arrays have the same shape.
     """
     pole = np.exp(-1.0 / time_constants)
-    total = (1.0 - pole) * (1.0 - FAST_POLE)
-    newer = NEWER_SHARE * total
-    return pole + FAST_POLE, -pole * FAST_POLE, newer, total - newer
+    sum_of_b = (1.0 - pole) * (1.0 - FAST_POLE)
+    b1 = NEWER_SHARE * sum_of_b
+    return pole + FAST_POLE, -pole * FAST_POLE, b1, sum_of_b - b1
+
+
+class UndelayedModels:
+    """Models of n plants at rest with a gain of 1 and no delay: the equation of `second_order`.
+
+    The models run in NumPy or in PyTorch, through which gradients can pass.
+
+    Parameters
+    ----------
+    time_constants
+        Time constants of the models, samples, shape (time constants, n).
+    convert
+        Function that converts a NumPy array to an array of the library in which the models run.
+
+    Attributes
+    ----------
+    outputs
+        Outputs s(k) of the models at the present sample, shape (time constants, n).
+    last_outputs
+        Outputs s(k-1) of the models at the last sample, shape (time constants, n).
+    last_flow
+        The flow f(k-1) of the last sample, as a share of half the actuator's range, shape (n,).
+    """
+
+    def __init__(
+        self, time_constants: Array, convert: Callable[[Array], Any] = np.asarray
+    ) -> None:
+        self._coefficients = [convert(values) for values in second_order(time_constants)]
+        self.outputs = convert(np.zeros_like(time_constants))
+        self.last_outputs = self.outputs
+        self.last_flow = convert(np.zeros_like(time_constants[0]))
+
+    def advance(self, flow: Any) -> None:
+        """Advance the models by a sample with the flow f(k), shape (n,)."""
+        a1, a2, b1, b2 = self._coefficients
+        next_outputs = a1 * self.outputs + a2 * self.last_outputs
+        next_outputs = next_outputs + b1 * flow + b2 * self.last_flow
+        self.last_outputs = self.outputs
+        self.outputs = next_outputs
+        self.last_flow = flow
 
 
 class Whitening:
@@ -163,6 +210,8 @@ class Bank:
         The fields of `prior`, as arrays of float32.
     estimate : Estimate
         Means and standard deviations over the models, renewed at every second sample.
+    variance : ndarray
+        Variance of the one-step errors, of the authority squared, shape (n,).
     innovation : ndarray
         The newest one-step error of the whitened output, mean over the models, of the
         authority, shape (n,).
@@ -175,124 +224,103 @@ class Bank:
 
     def __init__(self, prior: Prior) -> None:
         self.time_constants = np.asarray(prior.time_constants, np.float32)
-        self._prior = np.asarray(prior.log_probabilities, np.float32)
-        self._shortest = np.asarray(prior.shortest_delays, np.intp)
         self.gain_spread = np.asarray(prior.gain_spread, np.float32)
-        self._gain_variance = np.square(self.gain_spread)
-        models = self._prior.shape
-        self._count, constants, self.n = models
-        delays = self._shortest + np.arange(self._count)[:, np.newaxis]
+        self._log_priors = np.asarray(prior.log_probabilities, np.float32)
+        self._shortest_delays = np.asarray(prior.shortest_delays, np.intp)
+        self._delay_count, constants, self.n = self._log_priors.shape
+        delays = self._shortest_delays + np.arange(self._delay_count)[:, np.newaxis]
         self._delays = delays.astype(np.float32)
-        self._logarithms = np.log(self.time_constants)
-        poles = np.exp(-1.0 / self.time_constants)
-        self._poles = poles
-        self._fading = poles ** (self._delays[:, np.newaxis] + 1.0)
-        self._coefficients = second_order(self.time_constants)
-
-        def zeros(*shape: int) -> Array:
-            """Return zeros of this shape in float32."""
-            return np.zeros(shape, np.float32)
-
-        # Outputs s of the models with gain 1. `_response` has the last two samples of s without
-        # delay, and `_undelayed` s and the whitened s of past samples, in a ring. `_delayed`
-        # has s(k - d), newest first, and `_regressors` the whitened s(k - d) of each model.
-        self._response = deque(zeros(2, constants, self.n), maxlen=2)
-        self._flow = zeros(self.n)
-        self._undelayed = zeros(int(self._shortest.max()) + 1, 2, constants, self.n)
-        self._delayed = zeros(self._count + LAGS - 1, constants, self.n)
-        self._regressors = zeros(*models)
+        self._log_constants = np.log(self.time_constants)
+        self._poles = np.exp(-1.0 / self.time_constants)
+        self._fading = self._poles ** (self._delays[:, np.newaxis] + 1.0)
+        self._undelayed = UndelayedModels(self.time_constants)
         self._whiten_output = Whitening((self.n,))
         self._whiten_response = Whitening((constants, self.n))
-        self.outputs = zeros(LAGS, self.n)
-        self.responses = zeros(LAGS, self.n)
+        # Past outputs s of the models without delay, and the whitened s, in a ring: sample k
+        # has the row k modulo the number of rows.
+        ring_shape = (int(self._shortest_delays.max()) + 1, 2, constants, self.n)
+        self._ring = np.zeros(ring_shape, np.float32)
+        # Outputs s(k - d), newest first: the shortest delay, and then longer delays.
+        delayed_shape = (self._delay_count + LAGS - 1, constants, self.n)
+        self._delayed = np.zeros(delayed_shape, np.float32)
+        # The whitened s(k - d) of each model.
+        self._regressors = np.zeros_like(self._log_priors)
+        self.outputs = np.zeros((LAGS, self.n), np.float32)
         # Sums over past samples, in which old samples are forgotten exponentially.
-        self._information, self._products = zeros(*models), zeros(*models)
-        self._log_likelihoods = zeros(*models)
-        self._variance = zeros(self.n) + FIRST_NOISE**2
+        self._information = np.zeros_like(self._log_priors)
+        self._products = np.zeros_like(self._log_priors)
+        self._log_likelihoods = np.zeros_like(self._log_priors)
+        self.variance = np.full(self.n, FIRST_NOISE**2, np.float32)
         self._k = 0
-        self._plants = np.arange(self.n)
-        self.innovation = zeros(self.n)
         self._design()
-
-    @property
-    def variance(self) -> Array:
-        """Variance of the one-step errors, of the authority squared, shape (n,)."""
-        return self._variance
-
-    @property
-    def noise(self) -> Array:
-        """Standard deviation of the one-step errors, of the authority, shape (n,)."""
-        deviations: Array = np.sqrt(self._variance)
-        return deviations
 
     def observe(self, output: Array) -> None:
         """Update the models with the newest output y(k), of the authority, shape (n,)."""
         self.outputs[1:] = self.outputs[:-1]
         self.outputs[0] = output
-        rows = (self._k - self._shortest) % len(self._undelayed)
-        newest = self._undelayed[rows, :, :, self._plants].transpose(1, 2, 0)
         self._delayed[1:] = self._delayed[:-1]
         self._regressors[1:] = self._regressors[:-1]
+        rows = (self._k - self._shortest_delays) % len(self._ring)
+        # The index selects a row for each plant, and puts the axis of the plants first.
+        newest = self._ring[rows, :, :, np.arange(self.n)].transpose(1, 2, 0)
         self._delayed[0], self._regressors[0] = newest
         self._learn(self._whiten_output(self.outputs[0].copy()))
         self._k += 1
         if self._k % DESIGN_INTERVAL == 0:
             self._design()
-        self.responses = np.stack(
-            [
-                np.einsum("dtn,dtn->n", self._weights, self._delayed[lag : lag + self._count])
-                for lag in range(LAGS)
-            ]
-        )
+        means = []
+        for lag in range(LAGS):
+            delayed = self._delayed[lag : lag + self._delay_count]
+            means.append(np.einsum("dtn,dtn->n", self._weights, delayed))
+        self.responses = np.stack(means)
 
     def apply(self, flow: Array) -> None:
         """Update the models with the flow f(k) that the actuator passes, shape (n,).
 
         The flow is scaled by half the actuator's range. `apply` follows `observe` in a sample.
         """
-        a1, a2, newer, older = self._coefficients
-        response = a1 * self._response[0] + a2 * self._response[1]
-        response = response + newer * flow + older * self._flow
-        self._response.appendleft(response)
-        self._flow = flow
-        row = self._k % len(self._undelayed)
-        self._undelayed[row, 0] = response
-        self._undelayed[row, 1] = self._whiten_response(response)
+        self._undelayed.advance(flow)
+        response = self._undelayed.outputs
+        row = self._k % len(self._ring)
+        self._ring[row, 0] = response
+        self._ring[row, 1] = self._whiten_response(response)
 
     def _learn(self, whitened: Array) -> None:
-        """Update gains' sums, noise variance and log-likelihoods; called by `observe`.
+        """Update the sums for the gains, the noise variance and the models' log-likelihoods.
 
-        `whitened` is the newest output after the whitening filter, shape (n,).
+        `whitened` is the newest output after the whitening filter, of the authority, shape
+        (n,).
         """
-        regressors = self._regressors
-        errors = whitened - self._gains * regressors
+        errors = whitened - self._gains * self._regressors
         self.innovation = np.einsum("dtn,dtn->n", self._weights, errors)
-        np.square(errors, out=errors)
-        square = np.einsum("dtn,dtn->n", self._weights, errors)
-        errors *= 0.5 * CAUTION / self._variance
-        self._log_likelihoods *= MODEL_MEMORY
-        self._log_likelihoods -= errors
-        rate = max(NOISE_RATE, 1.0 / (FIRST_NOISE_SAMPLES + self._k))
-        square = np.minimum(square, OUTLIER * self._variance)
-        variance = self._variance + rate * (square - self._variance)
-        self._variance = np.maximum(variance, LEAST_NOISE**2).astype(np.float32)
-        self._information *= GAIN_MEMORY
-        self._information += np.square(regressors)
-        self._products *= GAIN_MEMORY
-        self._products += regressors * whitened
+        squares = np.square(errors)
+        self._log_likelihoods *= MODEL_FORGETTING
+        self._log_likelihoods -= squares * (0.5 * LIKELIHOOD_FACTOR / self.variance)
+        # The noise variance is at first the mean of all squared errors so far.
+        rate = max(LEAST_NOISE_RATE, 1.0 / (FIRST_NOISE_SAMPLES + self._k))
+        square = np.einsum("dtn,dtn->n", self._weights, squares)
+        square = np.minimum(square, LARGEST_SQUARE * self.variance)
+        variance = self.variance + rate * (square - self.variance)
+        self.variance = np.maximum(variance, LEAST_NOISE**2).astype(np.float32)
+        self._information *= GAIN_FORGETTING
+        self._information += np.square(self._regressors)
+        self._products *= GAIN_FORGETTING
+        self._products += self._regressors * whitened
 
     def _design(self) -> None:
         """Compute the gains and probabilities of the models, and `estimate`, from the sums."""
-        prior = self._variance / self._gain_variance
-        information = self._information + prior
-        self._gains = np.clip((self._products + prior) / information, *GAINS)
-        logarithms = self._log_likelihoods + self._prior
+        # The step test's gain, which is 1, counts like samples with this information.
+        prior = self.variance / np.square(self.gain_spread)
+        gains = (self._products + prior) / (self._information + prior)
+        self._gains = np.clip(gains, *GAIN_LIMITS)
+        logarithms = self._log_likelihoods + self._log_priors
         logarithms -= logarithms.max((0, 1))
-        self._weights = weights = np.exp(np.maximum(logarithms, UNLIKELY))
+        weights = np.exp(np.maximum(logarithms, LEAST_LOGARITHM))
         weights /= weights.sum((0, 1))
+        self._weights = weights
         shares = weights.sum(0)
         delay, delay_spread = _moments(weights.sum(1), self._delays)
-        log_constant, constant_spread = _moments(shares, self._logarithms)
+        log_constant, constant_spread = _moments(shares, self._log_constants)
         self.estimate = Estimate(
             shares=shares,
             delay=delay,

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.bank import CAUTION, FAST_POLE, GAINS, NOISE_COLOUR
+from agents.bank import FAST_POLE, GAIN_LIMITS, LIKELIHOOD_FACTOR, NOISE_COLOUR
 
 Array = NDArray[np.floating[Any]]
 
@@ -22,14 +22,17 @@ Array = NDArray[np.floating[Any]]
 LOAD_CHANGES: Final = np.array([0.001, 0.007, 0.03, 0.03])
 NOISE_SHARES: Final = np.array([1.0, 1.0, 1.0, 0.25])
 LOAD_MEMORY: Final = 0.998  # share of the load that is expected to remain after a sample
-# Standard deviation of the change of the gain per sample, as a share of the step test's gain,
-# for a gain whose standard deviation before the first sample is `REFERENCE_SPREAD`.
-GAIN_CHANGE: Final = 0.004
-REFERENCE_SPREAD: Final = 0.25
-FILTER_MEMORY: Final = 0.998  # forgetting factor of the filters' log-likelihoods, per sample
+# Standard deviation of the change of the gain per sample, divided by the standard deviation of
+# the gain before the first sample.
+GAIN_CHANGE: Final = 0.016
+FILTER_FORGETTING: Final = (
+    0.998  # forgetting factor of the filters' log-likelihoods, per sample
+)
 READING_SHARE: Final = 0.1  # share of the noise variance that is noise of the transmitter
 
-RESIDUAL, OLDER, LOAD, GAIN = range(4)  # places of the elements in the state of a filter
+# Indices of v(k), a2 v(k-1) + c xi(k), w(k) and g(k) in the state of a filter; the equations
+# are in the docstring of `OutputFilter`.
+RESIDUAL, LAST_RESIDUAL, LOAD, GAIN = range(4)
 
 
 class OutputFilter:
@@ -73,16 +76,15 @@ class OutputFilter:
         spread = np.asarray(gain_spread, np.float64)
         n = len(spread)
         filters = len(LOAD_CHANGES)
+        # At the start, load and residual are known to be 0, and the gain is that of the step
+        # test with an uncertainty.
         self._states = np.zeros((filters, n, 4))
         self._states[:, :, GAIN] = 1.0
         self._covariances = np.zeros((filters, n, 4, 4))
         self._covariances[:, :, GAIN, GAIN] = np.square(spread)
-        self._gain_changes = np.square(GAIN_CHANGE * spread / REFERENCE_SPREAD)
+        self._gain_changes = np.square(GAIN_CHANGE * spread)
         self._log_likelihoods = np.zeros((filters, n))
         self._response = np.zeros(n)
-        self.weights = np.full((filters, n), 1.0 / filters)
-        self.innovation = np.zeros(n)
-        self._summarise()
 
     def update(self, output: Array, responses: Array, poles: Array, variances: Array) -> None:
         """Update all filters with the outputs of a sample; call this method once per sample.
@@ -118,8 +120,7 @@ class OutputFilter:
         self._covariances = covariances - (
             corrections[:, :, :, np.newaxis] * effects[:, :, np.newaxis, :]
         )
-        self._weigh(errors, error_variances)
-        self._summarise()
+        self._average(errors, error_variances)
 
     def forecast(self, poles: Array, fading: Array) -> Array:
         """Return forecasts of the residuals v at the time when the present flows show, (n,).
@@ -136,7 +137,9 @@ class OutputFilter:
         fading
             Share of the distance between slow part and load that remains, shape (n,).
         """
-        slow = (poles * self._mean[RESIDUAL] + self._mean[OLDER]) / (poles - FAST_POLE)
+        slow = (poles * self._mean_state[RESIDUAL] + self._mean_state[LAST_RESIDUAL]) / (
+            poles - FAST_POLE
+        )
         slow_of_load = self.load * poles * (1.0 - FAST_POLE) / (poles - FAST_POLE)
         forecasts: Array = self.load + fading * (slow - slow_of_load)
         return forecasts
@@ -151,7 +154,7 @@ class OutputFilter:
         """
         residuals = -self._states[:, :, GAIN] * changes
         self._states[:, :, RESIDUAL] += residuals
-        self._states[:, :, OLDER] -= poles * FAST_POLE * residuals
+        self._states[:, :, LAST_RESIDUAL] -= poles * FAST_POLE * residuals
         self._states[:, :, LOAD] += residuals
 
     def _matrices(self, poles: Array, noises: Array) -> tuple[Array, Array]:
@@ -177,9 +180,9 @@ class OutputFilter:
         a2 = -poles * FAST_POLE
         transition = np.zeros((n, 4, 4))
         transition[:, RESIDUAL, RESIDUAL] = a1
-        transition[:, RESIDUAL, OLDER] = 1.0
+        transition[:, RESIDUAL, LAST_RESIDUAL] = 1.0
         transition[:, RESIDUAL, LOAD] = (1.0 - a1 - a2) * LOAD_MEMORY
-        transition[:, OLDER, RESIDUAL] = a2
+        transition[:, LAST_RESIDUAL, RESIDUAL] = a2
         transition[:, LOAD, LOAD] = LOAD_MEMORY
         transition[:, GAIN, GAIN] = 1.0
         from_xi = np.array([1.0, NOISE_COLOUR[0], 0.0, 0.0])
@@ -193,23 +196,20 @@ class OutputFilter:
         covariances[:, :, GAIN, GAIN] += self._gain_changes
         return transition, covariances
 
-    def _weigh(self, errors: Array, variances: Array) -> None:
-        """Update the probabilities of the filters, `weights`, and `innovation`.
+    def _average(self, errors: Array, variances: Array) -> None:
+        """Update the probabilities of the filters, and all attributes: means over the filters.
 
         `errors` are the filters' one-step errors at this sample, of the authority, and
         `variances` the variances that the filters expected, both of shape (filters, n).
         """
-        self._log_likelihoods *= FILTER_MEMORY
         losses = np.square(errors) / variances + np.log(variances)
-        self._log_likelihoods -= 0.5 * CAUTION * losses
+        self._log_likelihoods *= FILTER_FORGETTING
+        self._log_likelihoods -= 0.5 * LIKELIHOOD_FACTOR * losses
         weights = np.exp(self._log_likelihoods - self._log_likelihoods.max(0))
         self.weights = weights / weights.sum(0)
         self.innovation = (self.weights * errors).sum(0)
-
-    def _summarise(self) -> None:
-        """Compute `load`, `gain` and `gain_spread`, the means over the filters."""
-        self._mean = np.einsum("fn,fni->in", self.weights, self._states)
-        self.load = self._mean[LOAD]
-        self.gain = np.clip(self._mean[GAIN], *GAINS)
+        self._mean_state = np.einsum("fn,fni->in", self.weights, self._states)
+        self.load = self._mean_state[LOAD]
+        self.gain = np.clip(self._mean_state[GAIN], *GAIN_LIMITS)
         variance = (self.weights * self._covariances[:, :, GAIN, GAIN]).sum(0)
         self.gain_spread = np.sqrt(np.maximum(variance, 0.0))

@@ -122,7 +122,7 @@ class TestOutputFilter:
 
     def test_gain_and_load_are_those_of_all_samples_at_once(self, rng, monkeypatch):
         # The unknowns and the outputs are jointly normal: condition them in one step.
-        change, drift = 0.02, output_filter.GAIN_CHANGE * self.SPREAD / 0.25
+        change, drift = 0.02, output_filter.GAIN_CHANGE * self.SPREAD
         monkeypatch.setattr(output_filter, "LOAD_CHANGES", np.array([change]))
         monkeypatch.setattr(output_filter, "NOISE_SHARES", np.array([1.0]))
         samples = self.SAMPLES
