@@ -117,27 +117,6 @@ Count = Annotated[int, integer_from_1]
 Size = Annotated[int, integer_to_most]
 
 
-def check(name: str, value: Any, annotation: Any) -> Any:
-    """Return a value as the validator of an annotated type converts it.
-
-    Parameters
-    ----------
-    name
-        Name of the argument, for the message of an error.
-    value
-        The value to check.
-    annotation
-        A type with a validator, such as `Positive`.
-
-    Raises
-    ------
-    ValueError
-        If the validator rejects the value.
-    """
-    (validator,) = annotation.__metadata__
-    return validator(name, value)
-
-
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
     """Return real numbers as a float64 array of the same shape.
 
@@ -154,17 +133,14 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 @cache  # as reading the annotations is slow
-def _validated_fields(controller: type) -> dict[str, Any]:
-    """Return the types of those fields of a controller class that carry a validator.
-
-    The keys are the names of the fields, and a value is a type such as `Positive`.
-    """
+def _validators(controller: type) -> dict[str, Validator]:
+    """Return the validators of a controller class by the names of the fields that they check."""
     annotations = get_type_hints(controller, include_extras=True)
-    return {
-        name: annotation
-        for name, annotation in annotations.items()
-        if hasattr(annotation, "__metadata__")
-    }
+    validators = {}
+    for name, annotation in annotations.items():
+        if hasattr(annotation, "__metadata__"):  # a type such as `Positive`
+            (validators[name],) = annotation.__metadata__
+    return validators
 
 
 @dataclass(eq=False, kw_only=True)
@@ -214,8 +190,8 @@ class Controller(ABC):
         A subclass calls this method first, and then sets the attributes that its `reset` does
         not use.
         """
-        for name, annotation in _validated_fields(type(self)).items():
-            setattr(self, name, check(name, getattr(self, name), annotation))
+        for name, validator in _validators(type(self)).items():
+            setattr(self, name, validator(name, getattr(self, name)))
         if self.u_min >= self.u_max:
             raise ValueError(f"u_min must be below u_max = {self.u_max!r}, got {self.u_min!r}")
         self.reset()

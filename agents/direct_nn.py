@@ -17,7 +17,7 @@ from agents.controller import (
     NotNegative,
     Number,
     Size,
-    check,
+    integer_to_most,
 )
 from agents.networks import check_array, reading, write
 
@@ -43,7 +43,7 @@ class Weights:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the weights to the `.npz` file `path`, which `load` reads."""
-        write(path, {}, **vars(self))
+        write(path, **vars(self))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Weights:
@@ -137,7 +137,7 @@ class DirectNNController(Controller):
         if abs(self.direction) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
         if self.num_envs is not None:
-            check("num_envs", self.num_envs, Size)
+            integer_to_most("num_envs", self.num_envs)
         self.n_obs = max(self.n_inputs, self.error_index + 1)
         # Shapes of one network's weights.
         self._shapes = {

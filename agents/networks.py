@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.controller import Controller, Index, NotNegative, Values, check, check_numbers
+from agents.controller import Controller, Values, check_numbers, integer_from_0, not_negative
 
 Array = NDArray[np.floating[Any]]
 # The layers of a network, from the inputs on: a pair of weights, shape (outputs, inputs), and
@@ -92,21 +92,22 @@ def check_array(
     return array
 
 
-def check_layers(layers: Layers, inputs: int, outputs: int) -> list[tuple[Array, Array]]:
+def _checked_layers(layers: Layers, inputs: int) -> Layers:
     """Return copies of a network's layers in float32, if their shapes fit.
 
-    `inputs` and `outputs` are the numbers of inputs and outputs that the network must have. A
-    ValueError is raised if there is no layer, if the shape of a layer does not fit the layer
-    before or these numbers, or if a value is not finite.
+    A ValueError is raised if there is no layer, if the network has not `inputs` inputs and one
+    output, if the shapes of two layers do not fit, or if a value is not finite.
     """
     if not layers:
         raise ValueError("layers must hold at least one layer, got none")
     checked = []
     for i, (W, b) in enumerate(layers):
-        nodes = np.size(b) if i < len(layers) - 1 else outputs
+        is_last = i == len(layers) - 1
+        nodes = 1 if is_last else np.size(b)
         weights = check_array(f"weights of layers[{i}]", W, (nodes, inputs))
-        checked.append((weights, check_array(f"biases of layers[{i}]", b, (nodes,))))
-        inputs = nodes
+        biases = check_array(f"biases of layers[{i}]", b, (nodes,))
+        checked.append((weights, biases))
+        inputs = nodes  # of the next layer
     return checked
 
 
@@ -142,31 +143,8 @@ def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDAr
             raise ValueError(f"{path} holds no {holds}, or is damaged: {error}") from error
 
 
-def read_layers(file: Mapping[str, Array], layers: int, prefix: str = "") -> Layers:
-    """Return the layers of a network from a file that was written by `write`.
-
-    `file` is what `reading` yields, `layers` the number of layers, and `prefix` the network's
-    key in the argument `layers` of `write`.
-    """
-    return [(file[f"{prefix}W{i}"], file[f"{prefix}b{i}"]) for i in range(layers)]
-
-
-def write(path: str | PathLike[str], layers: Mapping[str, Layers], **arrays: Any) -> None:
-    """Write networks and other arrays to an `.npz` file.
-
-    Parameters
-    ----------
-    path
-        The file.
-    layers
-        The layers of each network. The key is a prefix for the names of the network's arrays:
-        layer i has the arrays `{prefix}W{i}` and `{prefix}b{i}`.
-    **arrays
-        Other arrays, by their names in the file.
-    """
-    for prefix, each in layers.items():
-        for i, (W, b) in enumerate(each):
-            arrays |= {f"{prefix}W{i}": W, f"{prefix}b{i}": b}
+def write(path: str | PathLike[str], **arrays: Any) -> None:
+    """Write arrays by name to the `.npz` file `path`, which `reading` opens."""
     with Path(path).open("wb") as file:
         np.savez_compressed(file, **arrays)
 
@@ -189,8 +167,8 @@ class Increments:
     zone, the edge of the dead zone is commanded instead of this limit."""
 
     def __post_init__(self) -> None:
-        check("max_move", self.max_move, NotNegative)
-        check("dead_zone", self.dead_zone, NotNegative)
+        not_negative("max_move", self.max_move)
+        not_negative("dead_zone", self.dead_zone)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -236,7 +214,7 @@ class PolicyNetwork(Controller):
             if name not in WINDOWS:
                 raise ValueError(f"observation must name {', '.join(WINDOWS)}, got {name!r}")
         self.observation = {
-            name: check(f"observation[{name!r}]", self.observation.get(name, 0), Index)
+            name: integer_from_0(f"observation[{name!r}]", self.observation.get(name, 0))
             for name in WINDOWS
         }
         self.n_obs = sum(self.observation.values())
@@ -246,7 +224,7 @@ class PolicyNetwork(Controller):
             )
         self._edge = self.increments.dead_zone if self.increments else 0.0
         self.input_scale = check_array("input_scale", self.input_scale, (self.n_obs,))
-        self.layers = check_layers(self.layers, self.n_obs, 1)
+        self.layers = _checked_layers(self.layers, self.n_obs)
         self._remembers = self.increments is not None
 
     @classmethod
@@ -275,7 +253,7 @@ class PolicyNetwork(Controller):
                 raise ValueError(f"its format is {about['format']!r}, not 1")
             increments = about["increments"]
             network = cls(
-                read_layers(file, about["layers"]),
+                [(file[f"W{i}"], file[f"b{i}"]) for i in range(about["layers"])],
                 observation=about["observation"],
                 input_scale=file["input_scale"],
                 activation=about["activation"],
@@ -295,7 +273,11 @@ class PolicyNetwork(Controller):
             "increments": None if self.increments is None else asdict(self.increments),
             "provenance": self.provenance,
         }
-        write(path, {"": self.layers}, about=json.dumps(about), input_scale=self.input_scale)
+        arrays = {}
+        for i, (W, b) in enumerate(self.layers):
+            arrays[f"W{i}"] = W
+            arrays[f"b{i}"] = b
+        write(path, about=json.dumps(about), input_scale=self.input_scale, **arrays)
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the network was not made for, by a ValueError.
@@ -304,10 +286,11 @@ class PolicyNetwork(Controller):
         `Controller`, the plants must have the observation that the network expects.
         """
         super().check_environment(parameters, wrapped, n)
-        given = {name: getattr(parameters, name) for name in WINDOWS}
-        if given != self.observation:
+        wanted = self.observation
+        windows = {name: getattr(parameters, name) for name in WINDOWS}
+        if windows != wanted:
             raise ValueError(
-                f"env must have the windows that policy wants, {self.observation}, got {given}"
+                f"env must have the windows that policy wants, {wanted}, got {windows}"
             )
 
     def reset(self) -> None:
@@ -327,14 +310,29 @@ class PolicyNetwork(Controller):
             )
         outputs = forward(self.layers, self.activation, rows * self.input_scale)
         output = np.clip(outputs[:, 0], -1.0, 1.0)
-        half_range, z = (self.u_max - self.u_min) / 2.0, self._edge
+        half_range = (self.u_max - self.u_min) / 2.0
         if self.increments is None:
             return self.u_min + (output + 1.0) * half_range
-        moved, lowest = self._flow + self.increments.max_move * output, self.u_min / half_range
-        self._flow = flow = np.clip(moved, lowest, self.u_max / half_range)
-        if z == 0.0:
+        wanted = self._flow + self.increments.max_move * output
+        lowest = self.u_min / half_range
+        flow = np.clip(wanted, lowest, self.u_max / half_range)
+        self._flow = flow
+        if self.increments.dead_zone == 0.0:
             return self.u_min + (flow - lowest) * half_range
+        return self._compensated(flow, self.increments.dead_zone)
+
+    def _compensated(self, flow: Array, edge: float) -> NDArray[np.float64]:
+        """Return the commands, t/h, shape (loops,), that compensate the dead zone.
+
+        The rule is that of `Increments.dead_zone`. `flow` are the wanted flows, as shares of
+        half the actuator's range, shape (loops,), and `edge` is the half width of the dead
+        zone, t/h.
+        """
+        half_range = (self.u_max - self.u_min) / 2.0
+        # The limit in the direction of the flow, t/h; any number other than 0 for a flow of 0.
         limit = np.where(flow > 0.0, self.u_max, np.where(flow < 0.0, -self.u_min, 1.0))
         share = np.abs(flow) * (half_range / limit)
-        command: NDArray[np.float64] = np.sign(flow) * (z + share * np.maximum(limit - z, 0.0))
+        command: NDArray[np.float64] = np.sign(flow) * (
+            edge + share * np.maximum(limit - edge, 0.0)
+        )
         return command

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from agents.controller import (
     Controller,
     Flag,
-    Gain,
     Index,
-    NotNegative,
     Number,
-    Positive,
     Values,
-    check,
+    nonzero,
+    not_negative,
+    positive,
 )
 
 Array = NDArray[np.float64]
@@ -100,15 +99,15 @@ class PIController(Controller):
             If an argument is out of range, or if the delay is 0 and no
             `closed_loop_time_constant` is given.
         """
-        k = check("gain", gain, Gain)
-        tau_1 = check("time_constant", time_constant, Positive)
-        theta = check("delay", delay, NotNegative)
+        k = nonzero("gain", gain)
+        tau_1 = positive("time_constant", time_constant)
+        theta = not_negative("delay", delay)
         if closed_loop_time_constant is None and theta == 0.0:
             raise ValueError("closed_loop_time_constant must be given where delay is 0")
         if closed_loop_time_constant is None:
             closed_loop_time_constant = theta
-        tau_c = check("closed_loop_time_constant", closed_loop_time_constant, Positive)
-        interval = check("sampling_interval", sampling_interval, Positive)
+        tau_c = positive("closed_loop_time_constant", closed_loop_time_constant)
+        interval = positive("sampling_interval", sampling_interval)
         # Equation (23) of Skogestad, with the sign of u = -Kp e, and equation (24).
         kp = -tau_1 / (k * (tau_c + theta))
         tau_i = min(tau_1, 4 * (tau_c + theta))

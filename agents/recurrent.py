@@ -6,14 +6,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.law import INPUTS, OUTPUTS
-from agents.networks import PRETRAINED, check_array, reading
+from agents.networks import PRETRAINED, check_array, reading, write
 
 Array = NDArray[np.floating[Any]]
 
@@ -118,9 +117,7 @@ class RecurrentNetwork:
     def save(self, path: str | PathLike[str]) -> None:
         """Write the network to the `.npz` file `path`, which `load` reads."""
         about = json.dumps({"format": FORMAT, "provenance": dict(self.provenance)})
-        arrays: dict[str, Any] = {**self.weights, "about": about}
-        with Path(path).open("wb") as file:
-            np.savez_compressed(file, **arrays)
+        write(path, **self.weights, about=about)
 
 
 def _sigmoid(values: Array) -> Array:
