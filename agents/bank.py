@@ -79,32 +79,6 @@ class Prior:
         return Prior(**repeated)
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """The estimates of a bank for n plants: means and standard deviations over its models.
-
-    All means are weighted by the probabilities of the models.
-    """
-
-    shares: Array
-    """Probabilities of the time constants, shape (time constants, n)."""
-    delay: Array
-    """Mean delay, samples, as the delay d of equation (28) of the paper, shape (n,)."""
-    delay_spread: Array
-    """Standard deviation of the delay, samples, shape (n,)."""
-    log_constant: Array
-    """Mean natural logarithm of the time constant in samples, shape (n,)."""
-    constant_spread: Array
-    """Standard deviation of the natural logarithm of the time constant, shape (n,)."""
-    pole: Array
-    """Mean of exp(-1 / T), the pole of a model with the time constant T in samples, shape
-    (n,)."""
-    fading: Array
-    """Mean of exp(-(d + 1) / T), shape (n,): the share of a deviation that remains after d + 1
-    samples, when the present flow shows in the output, if it decays with the time constant T
-    in samples."""
-
-
 def second_order(time_constants: Array) -> tuple[Array, Array, Array, Array]:
     """Return a1, a2, b1 and b2 of s(k) = a1 s(k-1) + a2 s(k-2) + b1 f(k-1) + b2 f(k-2).
 
@@ -208,8 +182,21 @@ class Bank:
         The number of plants.
     time_constants, gain_spread : ndarray
         The fields of `prior`, as arrays of float32.
-    estimate : Estimate
-        Means and standard deviations over the models, renewed at every second sample.
+    shares : ndarray
+        Probabilities of the time constants, shape (time constants, n).
+    delay, delay_spread : ndarray
+        Mean and standard deviation of the delay, samples, as the delay d of equation (28) of
+        the paper, shape (n,).
+    log_constant, log_constant_spread : ndarray
+        Mean and standard deviation of the natural logarithm of the time constant in samples,
+        shape (n,).
+    pole : ndarray
+        Mean of exp(-1 / T), the pole of a model with the time constant T in samples, shape
+        (n,).
+    fading : ndarray
+        Mean of exp(-(d + 1) / T), shape (n,): the share of a deviation that remains after d + 1
+        samples, when the present flow shows in the output, if the deviation decays with the
+        time constant T in samples.
     variance : ndarray
         Variance of the one-step errors, of the authority squared, shape (n,).
     innovation : ndarray
@@ -308,7 +295,7 @@ class Bank:
         self._products += self._regressors * whitened
 
     def _design(self) -> None:
-        """Compute the gains and probabilities of the models, and `estimate`, from the sums."""
+        """Compute the models' gains and probabilities, and the means over the models."""
         # The step test's gain, which is 1, counts like samples with this information.
         prior = self.variance / np.square(self.gain_spread)
         gains = (self._products + prior) / (self._information + prior)
@@ -318,18 +305,13 @@ class Bank:
         weights = np.exp(np.maximum(logarithms, LEAST_LOGARITHM))
         weights /= weights.sum((0, 1))
         self._weights = weights
-        shares = weights.sum(0)
-        delay, delay_spread = _moments(weights.sum(1), self._delays)
-        log_constant, constant_spread = _moments(shares, self._log_constants)
-        self.estimate = Estimate(
-            shares=shares,
-            delay=delay,
-            delay_spread=delay_spread,
-            log_constant=log_constant,
-            constant_spread=constant_spread,
-            pole=(shares * self._poles).sum(0),
-            fading=np.einsum("dtn,dtn->n", weights, self._fading),
-        )
+        self.shares = weights.sum(0)
+        self.delay, self.delay_spread = _moments(weights.sum(1), self._delays)
+        log_constant, log_constant_spread = _moments(self.shares, self._log_constants)
+        self.log_constant = log_constant
+        self.log_constant_spread = log_constant_spread
+        self.pole = (self.shares * self._poles).sum(0)
+        self.fading = np.einsum("dtn,dtn->n", weights, self._fading)
 
 
 def _moments(weights: Array, values: Array) -> tuple[Array, Array]:

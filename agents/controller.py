@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from numbers import Integral, Real
-from typing import Annotated, Any, Final, NoReturn, get_type_hints
+from typing import Annotated, Any, Final, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,12 +26,14 @@ MOST = 1_000_000
 Validator = Callable[[str, Any], Any]
 
 
-def _reject(name: str, value: Any, allowed: str) -> NoReturn:
-    """Raise a ValueError that says what the argument `name` must be, and its `value`.
+def _require(is_allowed: bool, name: str, value: Any, allowed: str) -> None:
+    """Raise a ValueError unless `is_allowed`: the argument `name` must be `allowed`.
 
-    `allowed` describes the allowed values in words, such as "a finite number".
+    `allowed` describes the allowed values in words, such as "a finite number", and the message
+    shows the argument's `value`.
     """
-    raise ValueError(f"{name} must be {allowed}, got {value!r}")
+    if not is_allowed:
+        raise ValueError(f"{name} must be {allowed}, got {value!r}")
 
 
 def _is_real(value: Any) -> bool:
@@ -51,57 +53,61 @@ def _is_integer(value: Any) -> bool:
 
 def finite(name: str, value: Any) -> float:
     """Return the argument `value` as a float; raise a ValueError unless it is finite."""
-    if not (_is_real(value) and math.isfinite(value)):
-        _reject(name, value, "a finite number")
+    _require(_is_real(value) and math.isfinite(value), name, value, "a finite number")
     return float(value)
 
 
 def not_negative(name: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is finite and at least 0."""
-    if not (_is_real(value) and 0.0 <= value < math.inf):
-        _reject(name, value, "a finite number of at least 0")
+    _require(
+        _is_real(value) and 0.0 <= value < math.inf,
+        name,
+        value,
+        "a finite number of at least 0",
+    )
     return float(value)
 
 
 def positive(name: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is finite and above 0."""
-    if not (_is_real(value) and 0.0 < value < math.inf):
-        _reject(name, value, "a finite number above 0")
+    _require(_is_real(value) and 0.0 < value < math.inf, name, value, "a finite number above 0")
     return float(value)
 
 
 def nonzero(name: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is finite and not 0."""
-    if not (_is_real(value) and 0.0 < abs(value) < math.inf):
-        _reject(name, value, "a finite number other than 0")
+    _require(
+        _is_real(value) and 0.0 < abs(value) < math.inf,
+        name,
+        value,
+        "a finite number other than 0",
+    )
     return float(value)
 
 
 def flag(name: str, value: Any) -> bool:
     """Return `value` as a bool; raise a ValueError unless it is True or False."""
-    if not isinstance(value, bool | np.bool_):
-        _reject(name, value, "True or False")
+    _require(isinstance(value, bool | np.bool_), name, value, "True or False")
     return bool(value)
 
 
 def integer_from_0(name: str, value: Any) -> int:
     """Return `value` as an int; raise a ValueError unless it is an integer of at least 0."""
-    if not (_is_integer(value) and value >= 0):
-        _reject(name, value, "an integer of at least 0")
+    _require(_is_integer(value) and value >= 0, name, value, "an integer of at least 0")
     return int(value)
 
 
 def integer_from_1(name: str, value: Any) -> int:
     """Return `value` as an int; raise a ValueError unless it is an integer of at least 1."""
-    if not (_is_integer(value) and value >= 1):
-        _reject(name, value, "an integer of at least 1")
+    _require(_is_integer(value) and value >= 1, name, value, "an integer of at least 1")
     return int(value)
 
 
 def integer_to_most(name: str, value: Any) -> int:
     """Return `value` as an int; raise a ValueError unless it is an integer from 1 to `MOST`."""
-    if not (_is_integer(value) and 1 <= value <= MOST):
-        _reject(name, value, f"an integer from 1 to {MOST:,}")
+    _require(
+        _is_integer(value) and 1 <= value <= MOST, name, value, f"an integer from 1 to {MOST:,}"
+    )
     return int(value)
 
 
@@ -134,7 +140,7 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 @cache  # as reading the annotations is slow
 def _validators(controller: type) -> dict[str, Validator]:
-    """Return the validators of a controller class by the names of the fields that they check."""
+    """Return the validators of a controller's fields by the names of the fields."""
     annotations = get_type_hints(controller, include_extras=True)
     validators = {}
     for name, annotation in annotations.items():
@@ -331,8 +337,8 @@ class ModelBasedController(Controller):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._delay_samples = self.delay / self.sampling_interval
-        if self._delay_samples > MOST:
+        self._edge = self.dead_zone
+        if self.delay / self.sampling_interval > MOST:
             raise ValueError(
                 f"delay must be at most {MOST:,} times sampling_interval = "
                 f"{self.sampling_interval!r}, got {self.delay!r}"

@@ -97,8 +97,6 @@ class DahlinController(InternalModelController):
         output = setpoint - rows[:, self.error_index]
         residual = output - self._delayed
         self._disturbance = self._disturbance + self._filter * (residual - self._disturbance)
-        now = self._undelayed
-        move = self._approach * (setpoint - self._disturbance - now)
-        command = self._passable(((1.0 - self._pole) * now + move) / self._input_gain)
-        self._advance(command)
-        return command
+        state = self._undelayed
+        move = self._approach * (setpoint - self._disturbance - state)
+        return self._command(((1.0 - self._pole) * state + move) / self._input_gain)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import avoid_dead_zone
-from agents.bank import LAGS, LEAST_NOISE, Bank, Estimate, UndelayedModels
+from agents.bank import LAGS, LEAST_NOISE, Bank, UndelayedModels
 from agents.hedge import RandomSetpoint
 from agents.output_filter import LOAD_CHANGES, OutputFilter
 
@@ -58,8 +58,11 @@ class Situation:
     """Target of the mean model's output at the time when the present flow shows, of the
     authority, shape (n,): the hedged set point (see `agents.hedge`) minus the forecast of the
     part of the output that the models do not explain."""
-    estimate: Estimate
-    """The bank's estimates of delays and time constants."""
+    shares: Array
+    """Probabilities of the bank's time constants, shape (time constants, n)."""
+    pole: Array
+    """Pole of the mean model: the mean of exp(-1 / T) over the bank's time constants T in
+    samples, shape (n,)."""
     gain: Array
     """Estimated gain of the plant, as a multiple of the step test's gain, shape (n,)."""
     gain_spread: Array
@@ -125,9 +128,8 @@ class Observer:
         """
         bank = self._bank
         bank.observe(output)
-        estimate = bank.estimate
-        self.filter.update(output, bank.responses[:2], estimate.pole, bank.variance)
-        forecast = self.filter.forecast(estimate.pole, estimate.fading)
+        self.filter.update(output, bank.responses[:2], bank.pole, bank.variance)
+        forecast = self.filter.forecast(bank.pole, bank.fading)
         # At the first sample, the set point counts as unchanged.
         is_unchanged = self._setpoint is None or setpoint == self._setpoint
         self._age = np.where(is_unchanged, self._age + 1.0, 0.0)
@@ -136,7 +138,7 @@ class Observer:
         held: Array = np.ones(bank.n)
         aim = setpoint
         if self._random_setpoint is not None:
-            ahead = estimate.delay + 1.0 + REACTION
+            ahead = bank.delay + 1.0 + REACTION
             held = self._random_setpoint.probability_held(self._age, ahead)
             aim = self._random_setpoint.targets(setpoint, held, FORECAST_SPREAD * deviation)
         noise = deviation + MODEL_ERROR
@@ -144,7 +146,8 @@ class Observer:
         self._k += 1
         return Situation(
             targets=(aim - forecast).astype(np.float32),
-            estimate=estimate,
+            shares=bank.shares,
+            pole=bank.pole,
             gain=self.filter.gain.astype(np.float32),
             gain_spread=self.filter.gain_spread.astype(np.float32),
             noise=noise,
@@ -186,7 +189,6 @@ class Observer:
             Shape (n, PAST_INPUTS).
         """
         bank = self._bank
-        estimate = bank.estimate
         load = self.filter.load
         gain = self.filter.gain
         residuals = bank.outputs - gain * bank.responses
@@ -204,12 +206,12 @@ class Observer:
             *self.filter.weights,
             3.0 * np.log(gain),
             5.0 * self.filter.gain_spread,
-            (estimate.delay - TYPICAL_DELAY) / 10.0,
-            estimate.delay_spread / 4.0,
-            2.0 * (estimate.log_constant - TYPICAL_LOG_CONSTANT),
-            4.0 * estimate.constant_spread,
+            (bank.delay - TYPICAL_DELAY) / 10.0,
+            bank.delay_spread / 4.0,
+            2.0 * (bank.log_constant - TYPICAL_LOG_CONSTANT),
+            4.0 * bank.log_constant_spread,
             0.5 * np.log(noise) + 1.5,
-            2.0 * estimate.fading - 1.0,
+            2.0 * bank.fading - 1.0,
             self._edge,
             self._centre,
             np.full(bank.n, min(self._k / 600.0, 2.0)),
@@ -288,7 +290,7 @@ class Law:
         """
         xp, convert = self._xp, self._convert
         gain = convert(situation.gain)
-        gains = gain * convert(situation.estimate.shares)
+        gains = gain * convert(situation.shares)
         model_output = (gains * self._models.outputs).sum(0)
         target = convert(situation.targets)
         share: Any = SHARE
@@ -306,7 +308,7 @@ class Law:
             share = 1.0 / (1.0 + xp.exp(xp.clip(-2.0 * half_logit, -20.0, 20.0)))
         # The flow for `target` holds the output there, and the flow for `approach` closes a
         # share of the gap in one sample.
-        rate = 1.0 - convert(situation.estimate.pole)
+        rate = 1.0 - convert(situation.pole)
         approach = share / rate * (target - model_output)
         flow = self._passable((target + approach) / gain)
         self._models.advance(flow)

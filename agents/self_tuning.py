@@ -124,7 +124,6 @@ class SelfTuningController(ModelBasedController):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
-        self._edge = self.dead_zone
         # The controller acts less often on a slow plant, so that in units of its own interval
         # the plant looks like the plants on which the networks were trained.
         constant = self.time_constant / self.sampling_interval
@@ -186,11 +185,10 @@ class SelfTuningController(ModelBasedController):
         """
         if self._k == 0:
             return {}
-        estimate = self._bank.estimate
         return {
             "gain": self.gain * self._observer.filter.gain,
-            "time_constant": self._interval * np.exp(estimate.log_constant),
-            "delay": self._interval * (estimate.delay + 1.0),
+            "time_constant": self._interval * np.exp(self._bank.log_constant),
+            "delay": self._interval * (self._bank.delay + 1.0),
         }
 
     def reset(self) -> None:

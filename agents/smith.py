@@ -105,6 +105,4 @@ class SmithPredictor(InternalModelController):
         wanted = self._integral - gain * error
         within = np.clip(wanted, self.u_min, self.u_max)
         self._integral = self._integral + self.ki / gain * (within - self._integral)
-        command = self._passable(wanted)
-        self._advance(command)
-        return command
+        return self._command(wanted)
