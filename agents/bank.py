@@ -37,12 +37,13 @@ MODEL_FORGETTING: Final = 0.9995
 LIKELIHOOD_FACTOR: Final = 0.5
 # Zero of the whitening filter. Nearer to 1, a load disturbs the estimates of gains less.
 LOAD_POLE: Final = 0.98
-# Standard deviation of the one-step errors that is expected at first, of the authority.
+# Expected standard deviation of the one-step errors before the first sample, in units of the
+# authority.
 FIRST_NOISE: Final = 0.07
 FIRST_NOISE_SAMPLES: Final = 30.0  # number of samples that `FIRST_NOISE` counts for
 LEAST_NOISE_RATE: Final = 0.004  # least weight of the newest error in the noise variance
-# Least standard deviation of the noise, of the authority. Smaller errors of the models would
-# come from their low order and not from noise.
+# Least standard deviation of the noise, in units of the authority. Smaller errors of the models
+# would come from the low order of the models and not from noise.
 LEAST_NOISE: Final = 0.003
 # A squared error is limited to this multiple of the variance, so that an outlier counts little.
 LARGEST_SQUARE: Final = 16.0
@@ -50,7 +51,7 @@ GAIN_LIMITS: Final = (0.3, 3.0)  # least and greatest gain, as multiples of the 
 # Least logarithm of a probability, relative to the most probable model: exp(-30) is nearly 0.
 LEAST_LOGARITHM: Final = -30.0
 # Samples between updates of the models' probabilities, which take the most computing time.
-DESIGN_INTERVAL: Final = 2
+ESTIMATE_INTERVAL: Final = 2
 LAGS: Final = 4  # number of latest outputs and of latest mean model outputs that a bank keeps
 
 
@@ -65,7 +66,8 @@ class Prior:
     """Time constants of the models, samples, shape (time constants, n)."""
     shortest_delays: ArrayLike
     """Shortest delay of each plant's models, samples, as the delay d of equation (28) of the
-    paper, shape (n,). The other delays of the models are 1, 2, ... samples longer."""
+    paper, shape (n,). The delays of a plant's models are this delay and 1, 2, ... samples
+    more."""
     log_probabilities: ArrayLike
     """Logarithms of the models' prior probabilities, up to a constant for each plant, shape
     (delays, time constants, n)."""
@@ -73,13 +75,13 @@ class Prior:
     """Standard deviation of the plant's gain before the first sample, as a share of the step
     test's gain, shape (n,)."""
 
-    def of_plants(self, n: int) -> Prior:
-        """Return the prior knowledge of n equal plants; `self` is that of one plant."""
+    def repeated(self, n: int) -> Prior:
+        """Return the prior knowledge of n equal plants; `self` must be that of one plant."""
         repeated = {name: np.repeat(values, n, axis=-1) for name, values in vars(self).items()}
         return Prior(**repeated)
 
 
-def second_order(time_constants: Array) -> tuple[Array, Array, Array, Array]:
+def model_coefficients(time_constants: Array) -> tuple[Array, Array, Array, Array]:
     """Return a1, a2, b1 and b2 of s(k) = a1 s(k-1) + a2 s(k-2) + b1 f(k-1) + b2 f(k-2).
 
     The equation is a model with the flow f as its input, the output s, a gain of 1 and no
@@ -93,7 +95,9 @@ def second_order(time_constants: Array) -> tuple[Array, Array, Array, Array]:
 
 
 class UndelayedModels:
-    """Models of n plants at rest with a gain of 1 and no delay: the equation of `second_order`.
+    """Models of n plants with a gain of 1 and no delay, one model for each time constant.
+
+    The equation of the models is that of `model_coefficients`. The models start at rest.
 
     The models run in NumPy or in PyTorch, through which gradients can pass.
 
@@ -111,13 +115,13 @@ class UndelayedModels:
     last_outputs
         Outputs s(k-1) of the models at the last sample, shape (time constants, n).
     last_flow
-        The flow f(k-1) of the last sample, as a share of half the actuator's range, shape (n,).
+        The flow f(k-1) of the last sample, in units of half the actuator's range, shape (n,).
     """
 
     def __init__(
         self, time_constants: Array, convert: Callable[[Array], Any] = np.asarray
     ) -> None:
-        self._coefficients = [convert(values) for values in second_order(time_constants)]
+        self._coefficients = [convert(values) for values in model_coefficients(time_constants)]
         self.outputs = convert(np.zeros_like(time_constants))
         self.last_outputs = self.outputs
         self.last_flow = convert(np.zeros_like(time_constants[0]))
@@ -135,7 +139,8 @@ class UndelayedModels:
 class Whitening:
     """The filter (1 - FAST_POLE/z) (1 - LOAD_POLE/z) / C(1/z), which makes noise nearly white.
 
-    The noise is that of equation (28) of the paper, C xi / A, with the polynomials A and C.
+    The plant's noise is C xi / A, with the polynomials A and C and the white noise xi of
+    equation (28) of the paper.
 
     Parameters
     ----------
@@ -164,9 +169,9 @@ class Bank:
 
     Here y is the output, d the delay in samples, and s the output of a model with gain 1 and no
     delay for the flows so far. The gain g of each model is estimated by recursive least squares
-    on whitened signals. The step test's gain is a prior, which is never forgotten. The
-    probability of a model follows from its one-step errors, which are taken for Gaussian. The
-    estimates of gains and the probabilities forget old samples exponentially.
+    on whitened signals, with the step test's gain as a prior. The probability of a model
+    follows from its one-step errors, which are taken for Gaussian. Gains and probabilities
+    forget old samples exponentially, but never the prior.
 
     At each sample, call `observe` with the output, read the attributes, choose a flow, and call
     `apply` with the flow.
@@ -198,12 +203,12 @@ class Bank:
         samples, when the present flow shows in the output, if the deviation decays with the
         time constant T in samples.
     variance : ndarray
-        Variance of the one-step errors, of the authority squared, shape (n,).
+        Variance of the one-step errors, in units of the authority squared, shape (n,).
     innovation : ndarray
-        The newest one-step error of the whitened output, mean over the models, of the
+        The newest one-step error of the whitened output, mean over the models, in units of the
         authority, shape (n,).
     outputs : ndarray
-        The latest outputs y(k), y(k-1), ..., of the authority, shape (LAGS, n).
+        The latest outputs y(k), y(k-1), ..., in units of the authority, shape (LAGS, n).
     responses : ndarray
         The mean of s(k - d) over the models, then the means of s(k - d - 1), ..., shape
         (LAGS, n).
@@ -214,7 +219,7 @@ class Bank:
         self.gain_spread = np.asarray(prior.gain_spread, np.float32)
         self._log_priors = np.asarray(prior.log_probabilities, np.float32)
         self._shortest_delays = np.asarray(prior.shortest_delays, np.intp)
-        self._delay_count, constants, self.n = self._log_priors.shape
+        self._delay_count, constant_count, self.n = self._log_priors.shape
         delays = self._shortest_delays + np.arange(self._delay_count)[:, np.newaxis]
         self._delays = delays.astype(np.float32)
         self._log_constants = np.log(self.time_constants)
@@ -222,13 +227,13 @@ class Bank:
         self._fading = self._poles ** (self._delays[:, np.newaxis] + 1.0)
         self._undelayed = UndelayedModels(self.time_constants)
         self._whiten_output = Whitening((self.n,))
-        self._whiten_response = Whitening((constants, self.n))
+        self._whiten_response = Whitening((constant_count, self.n))
         # Past outputs s of the models without delay, and the whitened s, in a ring: sample k
         # has the row k modulo the number of rows.
-        ring_shape = (int(self._shortest_delays.max()) + 1, 2, constants, self.n)
+        ring_shape = (int(self._shortest_delays.max()) + 1, 2, constant_count, self.n)
         self._ring = np.zeros(ring_shape, np.float32)
         # Outputs s(k - d), newest first: the shortest delay, and then longer delays.
-        delayed_shape = (self._delay_count + LAGS - 1, constants, self.n)
+        delayed_shape = (self._delay_count + LAGS - 1, constant_count, self.n)
         self._delayed = np.zeros(delayed_shape, np.float32)
         # The whitened s(k - d) of each model.
         self._regressors = np.zeros_like(self._log_priors)
@@ -239,12 +244,13 @@ class Bank:
         self._log_likelihoods = np.zeros_like(self._log_priors)
         self.variance = np.full(self.n, FIRST_NOISE**2, np.float32)
         self._k = 0
-        self._design()
+        self._renew_estimates()
 
     def observe(self, output: Array) -> None:
-        """Update the models with the newest output y(k), of the authority, shape (n,)."""
+        """Update the models with the newest output y(k), in units of the authority, (n,)."""
         self.outputs[1:] = self.outputs[:-1]
         self.outputs[0] = output
+        # What a model has now, the model with the next longer delay has at the next sample.
         self._delayed[1:] = self._delayed[:-1]
         self._regressors[1:] = self._regressors[:-1]
         rows = (self._k - self._shortest_delays) % len(self._ring)
@@ -253,8 +259,8 @@ class Bank:
         self._delayed[0], self._regressors[0] = newest
         self._learn(self._whiten_output(self.outputs[0].copy()))
         self._k += 1
-        if self._k % DESIGN_INTERVAL == 0:
-            self._design()
+        if self._k % ESTIMATE_INTERVAL == 0:
+            self._renew_estimates()
         means = []
         for lag in range(LAGS):
             delayed = self._delayed[lag : lag + self._delay_count]
@@ -262,9 +268,10 @@ class Bank:
         self.responses = np.stack(means)
 
     def apply(self, flow: Array) -> None:
-        """Update the models with the flow f(k) that the actuator passes, shape (n,).
+        """Update the models with the flow f(k) that the actuator passes.
 
-        The flow is scaled by half the actuator's range. `apply` follows `observe` in a sample.
+        `flow` is in units of half the actuator's range, shape (n,). At each sample, call this
+        method after `observe`.
         """
         self._undelayed.advance(flow)
         response = self._undelayed.outputs
@@ -275,8 +282,8 @@ class Bank:
     def _learn(self, whitened: Array) -> None:
         """Update the sums for the gains, the noise variance and the models' log-likelihoods.
 
-        `whitened` is the newest output after the whitening filter, of the authority, shape
-        (n,).
+        `whitened` is the newest output after the whitening filter, in units of the authority,
+        shape (n,).
         """
         errors = whitened - self._gains * self._regressors
         self.innovation = np.einsum("dtn,dtn->n", self._weights, errors)
@@ -294,11 +301,11 @@ class Bank:
         self._products *= GAIN_FORGETTING
         self._products += self._regressors * whitened
 
-    def _design(self) -> None:
+    def _renew_estimates(self) -> None:
         """Compute the models' gains and probabilities, and the means over the models."""
         # The step test's gain, which is 1, counts like samples with this information.
-        prior = self.variance / np.square(self.gain_spread)
-        gains = (self._products + prior) / (self._information + prior)
+        of_prior = self.variance / np.square(self.gain_spread)
+        gains = (self._products + of_prior) / (self._information + of_prior)
         self._gains = np.clip(gains, *GAIN_LIMITS)
         logarithms = self._log_likelihoods + self._log_priors
         logarithms -= logarithms.max((0, 1))
@@ -307,9 +314,7 @@ class Bank:
         self._weights = weights
         self.shares = weights.sum(0)
         self.delay, self.delay_spread = _moments(weights.sum(1), self._delays)
-        log_constant, log_constant_spread = _moments(self.shares, self._log_constants)
-        self.log_constant = log_constant
-        self.log_constant_spread = log_constant_spread
+        self.log_constant, self.log_constant_spread = _moments(self.shares, self._log_constants)
         self.pole = (self.shares * self._poles).sum(0)
         self.fading = np.einsum("dtn,dtn->n", weights, self._fading)
 

@@ -19,9 +19,9 @@ from agents.actuator import float32_action
 # set points and the latest three errors.
 PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
-# Largest number of nodes, loops, array elements or samples of delay that is accepted. A larger
-# argument is a typing error, and could exhaust the memory.
-MOST = 1_000_000
+# Largest number of nodes, loops or samples of delay that is accepted. A larger number is a
+# typing error, and could exhaust the memory.
+LARGEST_SIZE = 1_000_000
 
 Validator = Callable[[str, Any], Any]
 
@@ -36,14 +36,9 @@ def _require(is_allowed: bool, name: str, value: Any, allowed: str) -> None:
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
 
 
-def _is_real(value: Any) -> bool:
-    """Return whether a value is a real number, NaN and infinity included, but not a bool."""
-    return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
-
-
-def _is_integer(value: Any) -> bool:
-    """Return whether a value is an integer of Python or NumPy, but not a bool."""
-    return isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
+def _is_number(value: Any, kind: type[Any]) -> bool:
+    """Return whether a value is a number of a kind, `Real` or `Integral`, but not a bool."""
+    return isinstance(value, kind) and not isinstance(value, bool | np.bool_)
 
 
 # The following functions validate an argument: `name` is the argument's name, for the message.
@@ -52,36 +47,30 @@ def _is_integer(value: Any) -> bool:
 
 
 def finite(name: str, value: Any) -> float:
-    """Return the argument `value` as a float; raise a ValueError unless it is finite."""
-    _require(_is_real(value) and math.isfinite(value), name, value, "a finite number")
+    """Return `value` as a float; raise a ValueError unless it is a finite number."""
+    is_allowed = _is_number(value, Real) and math.isfinite(value)
+    _require(is_allowed, name, value, "a finite number")
     return float(value)
 
 
 def not_negative(name: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is finite and at least 0."""
-    _require(
-        _is_real(value) and 0.0 <= value < math.inf,
-        name,
-        value,
-        "a finite number of at least 0",
-    )
+    is_allowed = _is_number(value, Real) and 0.0 <= value < math.inf
+    _require(is_allowed, name, value, "a finite number of at least 0")
     return float(value)
 
 
 def positive(name: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is finite and above 0."""
-    _require(_is_real(value) and 0.0 < value < math.inf, name, value, "a finite number above 0")
+    is_allowed = _is_number(value, Real) and 0.0 < value < math.inf
+    _require(is_allowed, name, value, "a finite number above 0")
     return float(value)
 
 
 def nonzero(name: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is finite and not 0."""
-    _require(
-        _is_real(value) and 0.0 < abs(value) < math.inf,
-        name,
-        value,
-        "a finite number other than 0",
-    )
+    is_allowed = _is_number(value, Real) and 0.0 < abs(value) < math.inf
+    _require(is_allowed, name, value, "a finite number other than 0")
     return float(value)
 
 
@@ -93,21 +82,22 @@ def flag(name: str, value: Any) -> bool:
 
 def integer_from_0(name: str, value: Any) -> int:
     """Return `value` as an int; raise a ValueError unless it is an integer of at least 0."""
-    _require(_is_integer(value) and value >= 0, name, value, "an integer of at least 0")
+    is_allowed = _is_number(value, Integral) and value >= 0
+    _require(is_allowed, name, value, "an integer of at least 0")
     return int(value)
 
 
 def integer_from_1(name: str, value: Any) -> int:
     """Return `value` as an int; raise a ValueError unless it is an integer of at least 1."""
-    _require(_is_integer(value) and value >= 1, name, value, "an integer of at least 1")
+    is_allowed = _is_number(value, Integral) and value >= 1
+    _require(is_allowed, name, value, "an integer of at least 1")
     return int(value)
 
 
-def integer_to_most(name: str, value: Any) -> int:
-    """Return `value` as an int; raise a ValueError unless it is an integer from 1 to `MOST`."""
-    _require(
-        _is_integer(value) and 1 <= value <= MOST, name, value, f"an integer from 1 to {MOST:,}"
-    )
+def array_size(name: str, value: Any) -> int:
+    """Return `value` as an int; raise a ValueError unless it is from 1 to `LARGEST_SIZE`."""
+    is_allowed = _is_number(value, Integral) and 1 <= value <= LARGEST_SIZE
+    _require(is_allowed, name, value, f"an integer from 1 to {LARGEST_SIZE:,}")
     return int(value)
 
 
@@ -120,7 +110,7 @@ Gain = Annotated[float, nonzero]
 Flag = Annotated[bool, flag]
 Index = Annotated[int, integer_from_0]
 Count = Annotated[int, integer_from_1]
-Size = Annotated[int, integer_to_most]
+Size = Annotated[int, array_size]
 
 
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
@@ -144,8 +134,8 @@ def _validators(controller: type) -> dict[str, Validator]:
     annotations = get_type_hints(controller, include_extras=True)
     validators = {}
     for name, annotation in annotations.items():
-        if hasattr(annotation, "__metadata__"):  # a type such as `Positive`
-            (validators[name],) = annotation.__metadata__
+        if hasattr(annotation, "__metadata__"):  # an `Annotated` type such as `Positive`
+            validators[name] = annotation.__metadata__[0]
     return validators
 
 
@@ -238,18 +228,18 @@ class Controller(ABC):
                 f"policy must be made with the limits of env, u_min={limits[0]}, "
                 f"u_max={limits[1]}, got {self.u_min}, {self.u_max}"
             )
-        place = 0  # of the signal's newest sample in the observation
+        first = 0  # index of the signal's newest sample in the observation
         for signal in ("setpoint", "error"):
             window = getattr(parameters, f"{signal}_window")
             # None if the controller does not read this element alone.
             index = getattr(self, f"{signal}_index", None)
-            if index is not None and (index != place or not window):
+            if index is not None and (index != first or not window):
                 raise ValueError(
                     f"env must show its newest {signal} as element {index} of the observation, "
                     f"where policy reads it, got setpoint_window={parameters.setpoint_window}, "
                     f"error_window={parameters.error_window}"
                 )
-            place += window
+            first += window
         if wrapped:
             raise ValueError(
                 f"env must not be wrapped, as policy commands the flow itself, got {wrapped}"
@@ -288,8 +278,8 @@ class Controller(ABC):
         loops = values.shape[:-1]
         if self._loops_before not in (None, loops):
             raise ValueError(
-                f"observation must have shape {(*self._loops_before, self.n_obs)}, that of the "
-                f"loops since reset or of num_envs, got {values.shape}"
+                f"observation must have shape {(*self._loops_before, self.n_obs)}, for the "
+                f"loops since reset or for num_envs loops, got {values.shape}"
             )
         commands = self._control(np.atleast_2d(values))
         self.command = commands if loops else commands[0]
@@ -338,8 +328,8 @@ class ModelBasedController(Controller):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._edge = self.dead_zone
-        if self.delay / self.sampling_interval > MOST:
+        if self.delay / self.sampling_interval > LARGEST_SIZE:
             raise ValueError(
-                f"delay must be at most {MOST:,} times sampling_interval = "
+                f"delay must be at most {LARGEST_SIZE:,} times sampling_interval = "
                 f"{self.sampling_interval!r}, got {self.delay!r}"
             )

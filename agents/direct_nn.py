@@ -17,7 +17,7 @@ from agents.controller import (
     NotNegative,
     Number,
     Size,
-    integer_to_most,
+    array_size,
 )
 from agents.networks import check_array, reading, write
 
@@ -137,7 +137,7 @@ class DirectNNController(Controller):
         if abs(self.direction) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
         if self.num_envs is not None:
-            integer_to_most("num_envs", self.num_envs)
+            array_size("num_envs", self.num_envs)
         self.n_obs = max(self.n_inputs, self.error_index + 1)
         # Shapes of one network's weights.
         self._shapes = {

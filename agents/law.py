@@ -26,14 +26,15 @@ from agents.output_filter import LOAD_CHANGES, OutputFilter
 Array = NDArray[np.floating[Any]]
 
 SHARE: Final = 0.5  # share of the way to the target that one sample covers, without a network
-# Standard deviation of the error of a forecast over the delay, divided by that of the noise.
+# Standard deviation of the error of a forecast over the delay, as a multiple of the standard
+# deviation of the noise.
 FORECAST_SPREAD: Final = 1.2
 REACTION: Final = 2.0  # samples that the output takes, after the delay, to follow a flow
 # Errors that are inputs of a network are limited to this multiple of the noise, as larger
 # errors are outliers.
 LARGEST_ERROR: Final = 12.0
-# Added to the standard deviation of the noise, of the authority, so that tiny model errors do
-# not count as signals where there is hardly any noise.
+# Added to the standard deviation of the noise, in units of the authority. Without it, tiny
+# errors of the models would count as signals where there is hardly any noise.
 MODEL_ERROR: Final = 0.002
 # Delay, samples, and natural logarithm of the time constant in samples, of the paper's plant,
 # equation (28). They centre the inputs of a network.
@@ -55,9 +56,9 @@ class Situation:
     """The knowledge about n control loops at a sample, by which flows are chosen."""
 
     targets: Array
-    """Target of the mean model's output at the time when the present flow shows, of the
-    authority, shape (n,): the hedged set point (see `agents.hedge`) minus the forecast of the
-    part of the output that the models do not explain."""
+    """Target of the mean model's output at the time when the present flow shows, in units of
+    the authority, shape (n,): the hedged set point (see `agents.hedge`) minus the forecast of
+    the part of the output that the models do not explain."""
     shares: Array
     """Probabilities of the bank's time constants, shape (time constants, n)."""
     pole: Array
@@ -68,8 +69,8 @@ class Situation:
     gain_spread: Array
     """Standard deviation of `gain`, shape (n,)."""
     noise: Array
-    """Standard deviation of the bank's one-step errors, plus `MODEL_ERROR`, of the authority,
-    shape (n,)."""
+    """Standard deviation of the bank's one-step errors, plus `MODEL_ERROR`, in units of the
+    authority, shape (n,)."""
     inputs: Array
     """Inputs of a network that come from the observer, shape (n, PAST_INPUTS)."""
 
@@ -77,7 +78,7 @@ class Situation:
 class Observer:
     """The memory of n control loops: bank of models, Kalman filters, and age of the set point.
 
-    The observer uses NumPy alone, so no gradient of PyTorch passes through the observer.
+    The observer uses NumPy alone, so no gradient of PyTorch passes through it.
 
     Parameters
     ----------
@@ -89,8 +90,8 @@ class Observer:
     limits
         Lowest and highest flow, as shares of half the actuator's range, each of shape (n,).
     setpoint
-        The distribution of random set points, with amplitudes as shares of the authority; None
-        if nothing is known about changes of the set points.
+        The distribution of random set points, in units of the authority; None if nothing is
+        known about changes of the set points.
 
     Attributes
     ----------
@@ -122,9 +123,9 @@ class Observer:
         Parameters
         ----------
         setpoint
-            Set points y_d(k), of the authority, shape (n,).
+            Set points y_d(k), in units of the authority (see `agents.bank`), shape (n,).
         output
-            Measured outputs y(k), of the authority, shape (n,).
+            Measured outputs y(k), in units of the authority, shape (n,).
         """
         bank = self._bank
         bank.observe(output)
@@ -168,20 +169,20 @@ class Observer:
         Parameters
         ----------
         setpoint
-            Set points y_d(k), of the authority, shape (n,).
+            Set points y_d(k), in units of the authority (see `agents.bank`), shape (n,).
         output
-            Measured outputs y(k), of the authority, shape (n,).
+            Measured outputs y(k), in units of the authority, shape (n,).
         aim
-            Hedged set points (see `agents.hedge`), of the authority, shape (n,).
+            Hedged set points (see `agents.hedge`), in units of the authority, shape (n,).
         held
             Probabilities that the set points do not change before the present flow shows,
             shape (n,).
         forecast
-            Forecasts of the part of the output that the models do not explain, of the
+            Forecasts of the part of the output that the models do not explain, in units of the
             authority, shape (n,).
         noise
-            Standard deviations of one-step errors, plus `MODEL_ERROR`, of the authority, shape
-            (n,).
+            Standard deviations of one-step errors, plus `MODEL_ERROR`, in units of the
+            authority, shape (n,).
 
         Returns
         -------
@@ -318,7 +319,7 @@ class Law:
         """Return all inputs of a network, shape (n, INPUTS), of order 1.
 
         `model_output` is the output of the mean model without delay, and `change` its change
-        since the last sample, both of the authority, shape (n,).
+        since the last sample, both in units of the authority, shape (n,).
         """
         xp = self._xp
         gap = self._convert(situation.targets) - model_output

@@ -25,14 +25,13 @@ LOAD_MEMORY: Final = 0.998  # share of the load that is expected to remain after
 # Standard deviation of the change of the gain per sample, divided by the standard deviation of
 # the gain before the first sample.
 GAIN_CHANGE: Final = 0.016
-FILTER_FORGETTING: Final = (
-    0.998  # forgetting factor of the filters' log-likelihoods, per sample
-)
+# Forgetting factor of the filters' log-likelihoods, per sample.
+FILTER_FORGETTING: Final = 0.998
 READING_SHARE: Final = 0.1  # share of the noise variance that is noise of the transmitter
 
-# Indices of v(k), a2 v(k-1) + c xi(k), w(k) and g(k) in the state of a filter; the equations
-# are in the docstring of `OutputFilter`.
-RESIDUAL, LAST_RESIDUAL, LOAD, GAIN = range(4)
+# Indices in the state of a filter: the residual v(k), the part of v(k+1) that is carried over
+# from the last sample, the load w(k) and the gain g(k). See `OutputFilter`.
+RESIDUAL, CARRIED, LOAD, GAIN = range(4)
 
 
 class OutputFilter:
@@ -47,10 +46,10 @@ class OutputFilter:
 
     The noises xi and eta are white. The coefficients a1 and a2 follow from the poles of the
     mean model, and c is the coefficient of z^-1 in the polynomial C of equation (28) of the
-    paper. The gain g changes by a random walk. The state of a filter is v(k), a2 v(k-1) +
-    c xi(k), w(k) and g(k). The filters differ in the standard deviation of eta and in the
-    variance of xi. A filter is weighted by the likelihood of its one-step errors, in which old
-    errors are forgotten exponentially.
+    paper. The gain g changes by a random walk. The state of a filter has four elements: v(k),
+    a2 v(k-1) + c xi(k), w(k) and g(k). The filters differ in the standard deviation of eta and
+    in the variance of xi. The weight of a filter is the likelihood of its one-step errors,
+    which forgets old errors exponentially.
 
     Parameters
     ----------
@@ -64,10 +63,10 @@ class OutputFilter:
         Mean and standard deviation of the gain, as multiples of the step test's gain, shape
         (n,).
     load : ndarray
-        Mean of the load w, of the authority, shape (n,).
+        Mean of the load w, in units of the authority, shape (n,).
     innovation : ndarray
-        Newest one-step error of the output, mean over the filters, of the authority, shape
-        (n,).
+        Newest one-step error of the output, mean over the filters, in units of the authority,
+        shape (n,).
     weights : ndarray
         Probabilities of the filters, shape (filters, n).
     """
@@ -92,80 +91,85 @@ class OutputFilter:
         Parameters
         ----------
         output
-            Measured outputs y(k), of the authority, shape (n,).
+            Measured outputs y(k), in units of the authority (see `agents.bank`), shape (n,).
         responses
             Outputs s(k) and s(k-1) of the bank's present mean models with gain 1, shape (2, n).
         poles
             Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
             (n,).
         variances
-            Variances of the bank's one-step errors, of the authority squared, shape (n,).
+            Variances of the bank's one-step errors, in units of the authority squared, shape
+            (n,).
         """
-        response, previous = responses
-        self._follow(previous - self._response, poles)
+        response, last_response = responses
+        self._attribute_to_load(last_response - self._response, poles)
         self._response = response
+        # Predict the states of this sample from the states of the last sample.
         noises = NOISE_SHARES[:, np.newaxis] * variances
         transition, disturbances = self._matrices(poles, noises)
         states = np.einsum("nij,fnj->fni", transition, self._states)
         covariances = transition @ self._covariances @ transition.transpose(0, 2, 1)
         covariances = covariances + disturbances
-        # The output is the residual and the gain times the response.
+        # Predict the output, which is the sum of the residual and of gain times response.
+        # `effects` are the covariances of the states and the output.
         of_gain = response[:, np.newaxis] * covariances[:, :, :, GAIN]
         effects = covariances[:, :, :, RESIDUAL] + of_gain
         error_variances = effects[:, :, RESIDUAL] + response * effects[:, :, GAIN]
         error_variances = error_variances + READING_SHARE * noises
         errors = output - states[:, :, RESIDUAL] - response * states[:, :, GAIN]
+        # Correct the states by the errors of the predicted outputs.
         corrections = effects / error_variances[:, :, np.newaxis]
         self._states = states + corrections * errors[:, :, np.newaxis]
-        self._covariances = covariances - (
-            corrections[:, :, :, np.newaxis] * effects[:, :, np.newaxis, :]
-        )
+        products = corrections[:, :, :, np.newaxis] * effects[:, :, np.newaxis, :]
+        self._covariances = covariances - products
         self._average(errors, error_variances)
 
     def forecast(self, poles: Array, fading: Array) -> Array:
-        """Return forecasts of the residuals v at the time when the present flows show, (n,).
+        """Return forecasts of the residuals v for the time when the present flows show.
 
-        The residual v is the part of the output, of the authority, that the bank's mean model
-        does not explain. In d + 1 samples, for the delay d, the fast part of v decays to 0, and
-        the slow part of v moves from its present value to the load. The load is expected not to
-        change.
+        The residual v is the part of the output that the bank's mean model does not explain. In
+        d + 1 samples, for the delay d, the fast part of v decays to 0, and the slow part of v
+        moves from its present value to the load. The load is expected not to change. The
+        forecasts are in units of the authority (see `agents.bank`), shape (n,).
 
         Parameters
         ----------
         poles
-            Slow poles of the mean models, shape (n,).
+            Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
+            (n,).
         fading
-            Share of the distance between slow part and load that remains, shape (n,).
+            Share of the distance between the slow part and the load that remains after d + 1
+            samples, shape (n,).
         """
-        slow = (poles * self._mean_state[RESIDUAL] + self._mean_state[LAST_RESIDUAL]) / (
-            poles - FAST_POLE
-        )
+        residual = self._mean_state[RESIDUAL]
+        carried = self._mean_state[CARRIED]
+        slow = (poles * residual + carried) / (poles - FAST_POLE)
         slow_of_load = self.load * poles * (1.0 - FAST_POLE) / (poles - FAST_POLE)
         forecasts: Array = self.load + fading * (slow - slow_of_load)
         return forecasts
 
-    def _follow(self, changes: Array, poles: Array) -> None:
-        """Move part of the output from the model to the load, after a change of the mean model.
+    def _attribute_to_load(self, changes: Array, poles: Array) -> None:
+        """Attribute a change of the mean model's past output to a load, in all states.
 
         The probabilities of the bank's models change with time, and then the mean model
-        explains more or less of the same past output. The difference is attributed to a load
-        that has been constant for long. `changes` are the changes of s(k-1), shape (n,), and
-        `poles` the slow poles of the mean models, shape (n,).
+        explains more or less of a past output. The states change as if a load that has been
+        constant for long explained the difference. `changes` are the changes of s(k-1) in units
+        of the authority, and `poles` the slow poles of the mean models, both of shape (n,).
         """
         residuals = -self._states[:, :, GAIN] * changes
         self._states[:, :, RESIDUAL] += residuals
-        self._states[:, :, LAST_RESIDUAL] -= poles * FAST_POLE * residuals
+        self._states[:, :, CARRIED] -= poles * FAST_POLE * residuals
         self._states[:, :, LOAD] += residuals
 
     def _matrices(self, poles: Array, noises: Array) -> tuple[Array, Array]:
-        """Return the matrices of the filters' state equations for a sample.
+        """Return the transition matrices and noise covariances of the state equations.
 
         Parameters
         ----------
         poles
             Slow poles of the mean models, shape (n,).
         noises
-            Noise variances that the filters assume, of the authority squared, shape
+            Noise variances that the filters assume, in units of the authority squared, shape
             (filters, n).
 
         Returns
@@ -180,9 +184,9 @@ class OutputFilter:
         a2 = -poles * FAST_POLE
         transition = np.zeros((n, 4, 4))
         transition[:, RESIDUAL, RESIDUAL] = a1
-        transition[:, RESIDUAL, LAST_RESIDUAL] = 1.0
+        transition[:, RESIDUAL, CARRIED] = 1.0
         transition[:, RESIDUAL, LOAD] = (1.0 - a1 - a2) * LOAD_MEMORY
-        transition[:, LAST_RESIDUAL, RESIDUAL] = a2
+        transition[:, CARRIED, RESIDUAL] = a2
         transition[:, LOAD, LOAD] = LOAD_MEMORY
         transition[:, GAIN, GAIN] = 1.0
         from_xi = np.array([1.0, NOISE_COLOUR[0], 0.0, 0.0])
@@ -197,9 +201,9 @@ class OutputFilter:
         return transition, covariances
 
     def _average(self, errors: Array, variances: Array) -> None:
-        """Update the probabilities of the filters, and all attributes: means over the filters.
+        """Update the probabilities of the filters, and the means over the filters.
 
-        `errors` are the filters' one-step errors at this sample, of the authority, and
+        `errors` are the filters' one-step errors at this sample, in units of the authority, and
         `variances` the variances that the filters expected, both of shape (filters, n).
         """
         losses = np.square(errors) / variances + np.log(variances)

@@ -207,7 +207,7 @@ class SelfTuningController(ModelBasedController):
         edges = np.full(n, edge, np.float32)
         low, high = sorted([self.u_min / self._unit_flow, self.u_max / self._unit_flow])
         limits = np.full(n, low, np.float32), np.full(n, high, np.float32)
-        self._bank = Bank(self._prior.of_plants(n))
+        self._bank = Bank(self._prior.repeated(n))
         self._observer = Observer(self._bank, edges, limits, self._random_setpoint)
         self._law = Law(self._bank, edges, limits)
         # Function that computes corrections of the control law; None for no corrections.
