@@ -19,23 +19,24 @@ Array = NDArray[np.floating[Any]]
 
 # Time constants of the bank's models, as multiples of the step test's time constant.
 TIME_CONSTANTS: Final = np.array([0.63, 1.0, 1.55])
-# If the argument `delay_range` is None: shortest and longest delay of the models, and the
-# standard deviation of the delay's prior distribution, as multiples of the step test's delay.
-DELAYS: Final = (0.33, 2.0)
+# Prior distribution of the delay without the argument `delay_range`: shortest delay, longest
+# delay and standard deviation, as multiples of the step test's delay.
+SHORTEST_DELAY: Final = 0.33
+LONGEST_DELAY: Final = 2.0
 DELAY_SPREAD: Final = 0.33
 # Standard deviation of the natural logarithm of the time constant in the prior.
 CONSTANT_SPREAD: Final = 0.3
 # Standard deviation of the gain in the prior, as a share of the step test's gain.
 GAIN_SPREAD: Final = 0.25
-EXACT: Final = 1e-3  # the standard deviation of a gain that counts as known, of this gain
+KNOWN_GAIN_SPREAD: Final = 1e-3  # of a gain that counts as known
 # Greatest number of delays in a bank; a bank with more would not fit into the memory.
 MOST_DELAYS: Final = 10_000
 # Distance of the smallest flow from the dead zone, as a share of half the actuator's range:
 # enough for flows that are rounded to float32.
 CLEARANCE: Final = 1e-4
-# Time constant, samples, at twice which the controller starts to act less often. The networks
-# were trained on plants with time constants of about this length and less.
-SLOWEST: Final = 45.0
+# Longest time constant, samples, of most plants on which the networks were trained. On a plant
+# with an n times longer time constant, the controller acts at every n-th sample.
+TRAINED_TIME_CONSTANT: Final = 45.0
 
 
 def _time_range(name: str, value: Any) -> tuple[float, float] | None:
@@ -49,7 +50,7 @@ def _time_range(name: str, value: Any) -> tuple[float, float] | None:
     try:
         shortest, longest = map(float, value)
     except (TypeError, ValueError):
-        shortest = longest = math.nan
+        shortest = longest = math.nan  # which is refused below
     if not 0.0 <= shortest <= longest < math.inf:
         raise ValueError(
             f"{name} must be two finite numbers of at least 0, the shortest time first, "
@@ -62,10 +63,10 @@ TimeRange = Annotated[tuple[float, float] | None, _time_range]
 
 
 def _transport_delay(delay: float) -> int:
-    """Return the transport delay d of equation (28) of the paper, samples, of a plant.
+    """Return the transport delay d of equation (28) of the paper, samples.
 
-    `delay` is the delay from a change of the flow to the first change of a sampled output, in
-    samples: d + 1 or, if it is not an integer, about d + 1.
+    `delay` is the delay d + 1 from a change of the flow to the first change of a sampled
+    output, in samples; it may be a fraction, and is rounded.
     """
     return max(math.floor(delay + 0.5) - 1, 0)
 
@@ -87,10 +88,10 @@ class SelfTuningController(ModelBasedController):
       yet shown in the output, and the next flow moves the predicted output to the target. See
       `agents.law`.
 
-    A command is 0 or outside the dead zone, so the flow that passes the actuator is known to
-    the models. All quantities are scaled, so the controller suits plants with a gain of either
-    sign, with any limits and any sampling interval. If the time constant is 90 samples or more,
-    the controller changes the command at every second sample or less often.
+    A command is 0 or outside the dead zone, so the flow that passes the actuator is known. All
+    quantities are scaled, so the controller suits plants with a gain of either sign, with any
+    limits and any sampling interval. If the time constant is 90 samples or more, the controller
+    changes the command at every second sample or less often.
 
     The other parameters are those of `ModelBasedController`.
 
@@ -99,10 +100,9 @@ class SelfTuningController(ModelBasedController):
     dead_zone
         The greatest half width that the dead zone may have, t/h.
     delay_range
-        Shortest and longest delay that the plant may have, s, including the one sample that any
-        input takes to show. All delays in this range are equally likely. By default, the delay
-        is between a third and twice the delay of the step test, and a delay near that of the
-        step test is more likely.
+        Shortest and longest delay that the plant may have, s, defined as the argument `delay`.
+        All delays in this range are equally likely. By default, the plant's delay is between a
+        third and twice the argument `delay`, and likely to be near the argument.
     setpoint_holds
         Shortest and longest time, s, for which the set point keeps a random level. All times in
         this range are equally likely. By default, nothing is known about changes of the set
@@ -124,14 +124,16 @@ class SelfTuningController(ModelBasedController):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
-        # The controller acts less often on a slow plant, so that in units of its own interval
-        # the plant looks like the plants on which the networks were trained.
-        constant = self.time_constant / self.sampling_interval
-        self._every = max(1, int(constant / SLOWEST))  # samples from an action to the next
-        self._constant = constant / self._every
-        self._interval = self.sampling_interval * self._every  # s
-        self._unit_flow = math.copysign((self.u_max - self.u_min) / 2.0, self.gain)  # t/h
-        self._authority = self.gain * self._unit_flow  # degC
+        # The controller changes the command less often on a slow plant. Measured in intervals
+        # between changes, the plant then is as fast as those of the networks' training.
+        time_constant = self.time_constant / self.sampling_interval  # samples
+        self._samples_held = max(1, int(time_constant / TRAINED_TIME_CONSTANT))
+        self._interval = self.sampling_interval * self._samples_held  # s
+        self._time_constant = time_constant / self._samples_held  # intervals
+        # The unit of flows, t/h, is negative for a negative gain: a positive scaled flow raises
+        # the temperature. The unit of temperatures, degC, is the authority.
+        self._unit_flow = math.copysign((self.u_max - self.u_min) / 2.0, self.gain)
+        self._authority = self.gain * self._unit_flow
         self._prior = self._prior_of_plant()
         self._random_setpoint = self._setpoint_distribution()
 
@@ -141,40 +143,41 @@ class SelfTuningController(ModelBasedController):
         A ValueError is raised if the bank would have too many delays.
         """
         likely = self.delay / self._interval
-        shortest, longest = DELAYS[0] * likely, DELAYS[1] * likely
-        if self.delay_range is not None:
+        if self.delay_range is None:
+            shortest = SHORTEST_DELAY * likely
+            longest = LONGEST_DELAY * likely
+            spread = max(DELAY_SPREAD * likely, 1.0)
+        else:
             shortest, longest = (time / self._interval for time in self.delay_range)
+            spread = math.inf  # all delays are equally likely
         first = _transport_delay(shortest)
         delays = np.arange(first, _transport_delay(longest) + 1)
         if len(delays) > MOST_DELAYS:
             raise ValueError(
                 f"delay_range must hold at most {MOST_DELAYS:,} samples, got {len(delays):,}"
             )
-        of_delays = np.zeros(len(delays))
-        if self.delay_range is None:
-            deviations = (delays + 1.0 - likely) / max(DELAY_SPREAD * likely, 1.0)
-            of_delays = -0.5 * np.square(deviations)
+        of_delays = -0.5 * np.square((delays + 1.0 - likely) / spread)
         of_constants = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
         logarithms = of_delays[:, np.newaxis] + of_constants
         return Prior(
-            time_constants=(self._constant * TIME_CONSTANTS)[:, np.newaxis],
+            time_constants=(self._time_constant * TIME_CONSTANTS)[:, np.newaxis],
             shortest_delays=[first],
             log_probabilities=logarithms[:, :, np.newaxis],
             gain_spread=[GAIN_SPREAD],
         )
 
     def _setpoint_distribution(self) -> RandomSetpoint | None:
-        """Return the distribution of the set point, scaled; None if it is not known.
+        """Return the distribution of the set point; None if it is not known.
 
-        Times are in intervals at which the controller acts, and the amplitude is a share of the
-        authority.
+        Times are in intervals between changes of the command, and the amplitude is in units of
+        the authority (see `agents.bank`).
         """
         if self.setpoint_holds is None:
             return None
         shortest, longest = (
-            time / self.sampling_interval / self._every for time in self.setpoint_holds
+            time / self.sampling_interval / self._samples_held for time in self.setpoint_holds
         )
-        return RandomSetpoint(shortest, longest, self.setpoint_amplitude / abs(self._authority))
+        return RandomSetpoint(shortest, longest, self.setpoint_amplitude / self._authority)
 
     @property
     def estimates(self) -> dict[str, Array]:
@@ -221,7 +224,7 @@ class SelfTuningController(ModelBasedController):
         """
         if self._k == 0:
             self._start(len(rows))
-        if self._k % self._every == 0:
+        if self._k % self._samples_held == 0:
             setpoint = rows[:, self.setpoint_index] / self._authority
             output = setpoint - rows[:, self.error_index] / self._authority
             situation = self._observer.observe(
@@ -281,8 +284,8 @@ class NeuralSmithPredictor(NeuralSelfTuningController):
     def _prior_of_plant(self) -> Prior:
         """Return the prior knowledge of a plant: its only model is that of the step test."""
         return Prior(
-            time_constants=[[self._constant]],
+            time_constants=[[self._time_constant]],
             shortest_delays=[_transport_delay(self.delay / self._interval)],
             log_probabilities=[[[0.0]]],
-            gain_spread=[EXACT],
+            gain_spread=[KNOWN_GAIN_SPREAD],
         )
