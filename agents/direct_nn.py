@@ -19,7 +19,7 @@ from agents.controller import (
     Size,
     array_size,
 )
-from agents.networks import check_array, reading, write
+from agents.networks import check_array, open_arrays, write_arrays
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class Weights:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the weights to the `.npz` file `path`, which `load` reads."""
-        write(path, **vars(self))
+        write_arrays(path, **vars(self))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Weights:
@@ -51,7 +51,7 @@ class Weights:
 
         A ValueError is raised if the file is damaged or holds something else.
         """
-        with reading(path, "weights") as file:
+        with open_arrays(path, "weights") as file:
             return cls(**{field.name: file[field.name] for field in fields(cls)})
 
 

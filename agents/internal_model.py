@@ -30,14 +30,15 @@ class InternalModelController(ModelBasedController):
         self._delay = max(round(self.delay / self.sampling_interval), 1)  # samples
 
     def reset(self) -> None:
-        """Set the model's outputs to 0, as for a plant at rest, before a new episode."""
+        """Set the model's output to 0, as for a plant at rest, before a new episode."""
         super().reset()
-        self._outputs: list[Values] = []  # of the undelayed model, degC; the newest is last
+        # Outputs of the undelayed model within the delay, degC; the newest is last.
+        self._outputs: list[Values] = [np.float64(0.0)]
 
     @property
     def _undelayed(self) -> Values:
         """The output of the model if it had no delay, degC; shape (loops,), or () at first."""
-        return self._outputs[-1] if self._outputs else np.float64(0.0)
+        return self._outputs[-1]
 
     @property
     def _delayed(self) -> Values:
@@ -45,7 +46,7 @@ class InternalModelController(ModelBasedController):
 
         If the model is right, a plant without noise and load has this output now.
         """
-        return self._outputs[0] if self._outputs else np.float64(0.0)
+        return self._outputs[0]
 
     def _command(self, wanted: Array) -> Array:
         """Return the commands for wanted flows, and advance the model by a sample.
@@ -55,7 +56,7 @@ class InternalModelController(ModelBasedController):
         """
         command: Array = avoid_dead_zone(wanted, self.dead_zone)
         applied = applied_flow(command, self.dead_zone, self.u_min, self.u_max)
-        outputs = self._outputs or [np.float64(0.0)] * self._delay
-        newest = self._pole * outputs[-1] + self._input_gain * applied
-        self._outputs = [*outputs[1:], newest]
+        self._outputs.append(self._pole * self._undelayed + self._input_gain * applied)
+        if len(self._outputs) > self._delay:
+            del self._outputs[0]
         return command

@@ -194,16 +194,19 @@ class Observer:
         gain = self.filter.gain
         residuals = bank.outputs - gain * bank.responses
         signals = [
+            # the set point
             setpoint,
             np.abs(setpoint),
             aim - setpoint,
             held,
+            # the output, and what the models do not explain
             output,
             load,
             forecast - load,
             *_relative_errors(residuals, noise),
             _relative_errors(bank.innovation, noise),
             _relative_errors(self.filter.innovation, noise),
+            # the estimates of filters and bank
             *self.filter.weights,
             3.0 * np.log(gain),
             5.0 * self.filter.gain_spread,
@@ -213,6 +216,7 @@ class Observer:
             4.0 * bank.log_constant_spread,
             0.5 * np.log(noise) + 1.5,
             2.0 * bank.fading - 1.0,
+            # the actuator, and the time since the start of the episode
             self._edge,
             self._centre,
             np.full(bank.n, min(self._k / 600.0, 2.0)),
@@ -291,7 +295,7 @@ class Law:
         """
         xp, convert = self._xp, self._convert
         gain = convert(situation.gain)
-        gains = gain * convert(situation.shares)
+        gains = gain * convert(situation.shares)  # factors of the models in the mean model
         model_output = (gains * self._models.outputs).sum(0)
         target = convert(situation.targets)
         share: Any = SHARE

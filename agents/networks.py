@@ -26,9 +26,10 @@ Layers = Sequence[tuple[Array, Array]]
 # Arguments of the environment that determine the observation, in the order of its elements.
 WINDOWS: Final = ("setpoint_window", "error_window", "output_window", "action_window")
 PRETRAINED: Final = Path(__file__).parent / "pretrained"  # trained networks of this project
-# Largest size of a network file, bytes of all its unpacked arrays: 64 MiB, hundreds of times
-# what a network needs. A larger file could exhaust the memory.
-LARGEST: Final = 2**26
+# Largest size of all unpacked arrays of a network file, bytes: 64 MiB, hundreds of times what a
+# network needs. A larger file could exhaust the memory.
+LARGEST_FILE: Final = 2**26
+FORMAT: Final = 1  # version of the format of network files
 # The activation functions of hidden layers, by name.
 ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
     "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
@@ -112,7 +113,9 @@ def _checked_layers(layers: Layers, inputs: int) -> Layers:
 
 
 @contextmanager
-def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDArray[Any]]]:
+def open_arrays(
+    path: str | PathLike[str], contents: str
+) -> Iterator[Mapping[str, NDArray[Any]]]:
     """Open an `.npz` file as a mapping of arrays by name, for a `with` statement.
 
     Nothing in the file is executed.
@@ -121,14 +124,14 @@ def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDAr
     ----------
     path
         The file.
-    holds
+    contents
         What the file should hold, in words, for the message of an error.
 
     Raises
     ------
     ValueError
-        If the file is damaged or larger than `LARGEST`, or if the `with` block raises an error
-        because of the file's contents.
+        If the file is damaged or larger than `LARGEST_FILE`, or if the `with` block raises an
+        error, as the contents of the file then are wrong.
     OSError
         If the file cannot be opened.
     """
@@ -136,17 +139,29 @@ def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDAr
         try:
             with np.load(raw, allow_pickle=False) as file:
                 size = sum(member.file_size for member in file.zip.infolist())
-                if size > LARGEST:
-                    raise ValueError(f"its arrays have {size:,} bytes, over {LARGEST:,}")
+                if size > LARGEST_FILE:
+                    raise ValueError(f"its arrays have {size:,} bytes, over {LARGEST_FILE:,}")
                 yield file
         except Exception as error:  # from zip, zlib, NumPy, JSON or a check
-            raise ValueError(f"{path} holds no {holds}, or is damaged: {error}") from error
+            raise ValueError(f"{path} holds no {contents}, or is damaged: {error}") from error
 
 
-def write(path: str | PathLike[str], **arrays: Any) -> None:
-    """Write arrays by name to the `.npz` file `path`, which `reading` opens."""
+def write_arrays(path: str | PathLike[str], **arrays: Any) -> None:
+    """Write arrays by name to the `.npz` file `path`, which `open_arrays` reads."""
     with Path(path).open("wb") as file:
         np.savez_compressed(file, **arrays)
+
+
+def read_settings(file: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return the settings in a network file: the JSON object in the array `about`.
+
+    `file` is what `open_arrays` yields. A ValueError is raised if the file has another format
+    than `FORMAT`.
+    """
+    settings: dict[str, Any] = json.loads(str(file["about"]))
+    if settings["format"] != FORMAT:
+        raise ValueError(f"its format is {settings['format']!r}, not {FORMAT}")
+    return settings
 
 
 @dataclass(frozen=True)
@@ -218,14 +233,16 @@ class PolicyNetwork(Controller):
             for name in WINDOWS
         }
         self.n_obs = sum(self.observation.values())
-        if self.activation not in [*ACTIVATIONS]:  # a list: it may be unhashable
+        if self.activation not in [*ACTIVATIONS]:  # a list, as `activation` may be unhashable
             raise ValueError(
                 f"activation must be one of {[*ACTIVATIONS]}, got {self.activation!r}"
             )
-        self._edge = self.increments.dead_zone if self.increments else 0.0
         self.input_scale = check_array("input_scale", self.input_scale, (self.n_obs,))
         self.layers = _checked_layers(self.layers, self.n_obs)
-        self._remembers = self.increments is not None
+        if self.increments is None:
+            self._remembers = False
+        else:
+            self._edge = self.increments.dead_zone
 
     @classmethod
     def load(
@@ -247,37 +264,40 @@ class PolicyNetwork(Controller):
         OSError
             If the file cannot be opened.
         """
-        with reading(path, "policy network") as file:
-            about = json.loads(str(file["about"]))
-            if about["format"] != 1:
-                raise ValueError(f"its format is {about['format']!r}, not 1")
-            increments = about["increments"]
+        with open_arrays(path, "policy network") as file:
+            settings = read_settings(file)
+            increments = settings["increments"]
+            if increments is not None:
+                increments = Increments(**increments)
             network = cls(
-                [(file[f"W{i}"], file[f"b{i}"]) for i in range(about["layers"])],
-                observation=about["observation"],
+                [(file[f"W{i}"], file[f"b{i}"]) for i in range(settings["layers"])],
+                observation=settings["observation"],
                 input_scale=file["input_scale"],
-                activation=about["activation"],
-                increments=None if increments is None else Increments(**increments),
-                provenance=about["provenance"],
+                activation=settings["activation"],
+                increments=increments,
+                provenance=settings["provenance"],
             )
         # Outside the `with` block: invalid limits do not mean that the file is damaged.
         return replace(network, u_min=u_min, u_max=u_max)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the network, without the limits of the flow, to the `.npz` file `path`."""
-        about = {
-            "format": 1,
+        increments = None
+        if self.increments is not None:
+            increments = asdict(self.increments)
+        settings = {
+            "format": FORMAT,
             "layers": len(self.layers),
             "observation": self.observation,
             "activation": self.activation,
-            "increments": None if self.increments is None else asdict(self.increments),
+            "increments": increments,
             "provenance": self.provenance,
         }
         arrays = {}
         for i, (W, b) in enumerate(self.layers):
             arrays[f"W{i}"] = W
             arrays[f"b{i}"] = b
-        write(path, about=json.dumps(about), input_scale=self.input_scale, **arrays)
+        write_arrays(path, about=json.dumps(settings), input_scale=self.input_scale, **arrays)
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the network was not made for, by a ValueError.

@@ -102,16 +102,18 @@ class PIController(Controller):
         k = nonzero("gain", gain)
         tau_1 = positive("time_constant", time_constant)
         theta = not_negative("delay", delay)
-        if closed_loop_time_constant is None and theta == 0.0:
-            raise ValueError("closed_loop_time_constant must be given where delay is 0")
         if closed_loop_time_constant is None:
+            if theta == 0.0:
+                raise ValueError("closed_loop_time_constant must be given where delay is 0")
             closed_loop_time_constant = theta
         tau_c = positive("closed_loop_time_constant", closed_loop_time_constant)
         interval = positive("sampling_interval", sampling_interval)
         # Equation (23) of Skogestad, with the sign of u = -Kp e, and equation (24).
         kp = -tau_1 / (k * (tau_c + theta))
         tau_i = min(tau_1, 4 * (tau_c + theta))
-        return cls(kp, kp * interval / tau_i, **{"anti_windup": True, **arguments})
+        ki = kp * interval / tau_i
+        arguments.setdefault("anti_windup", True)
+        return cls(kp, ki, **arguments)
 
     def reset(self) -> None:
         """Set the sum of the errors to zero, before a new episode."""

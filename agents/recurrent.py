@@ -12,12 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.law import INPUTS, OUTPUTS
-from agents.networks import PRETRAINED, check_array, reading, write
+from agents.networks import (
+    FORMAT,
+    PRETRAINED,
+    check_array,
+    open_arrays,
+    read_settings,
+    write_arrays,
+)
 
 Array = NDArray[np.floating[Any]]
 
 DEFAULT_FILE: Final = PRETRAINED / "neural-10000.npz"  # the network of training seed 10,000
-FORMAT: Final = 1  # version of the file format, which `load` checks
 
 
 @dataclass(frozen=True)
@@ -106,21 +112,19 @@ class RecurrentNetwork:
 
         A ValueError is raised if the file is damaged or holds something else.
         """
-        with reading(path, "recurrent network") as file:
-            about = json.loads(str(file["about"]))
-            if about["format"] != FORMAT:
-                raise ValueError(f"its format is {about['format']!r}, not {FORMAT}")
+        with open_arrays(path, "recurrent network") as file:
+            settings = read_settings(file)
             names = [name for name in cls.__annotations__ if name != "provenance"]
             weights = {name: file[name] for name in names}
-            return cls(**weights, provenance=about["provenance"])
+            return cls(**weights, provenance=settings["provenance"])
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the network to the `.npz` file `path`, which `load` reads."""
-        about = json.dumps({"format": FORMAT, "provenance": dict(self.provenance)})
-        write(path, **self.weights, about=about)
+        settings = {"format": FORMAT, "provenance": dict(self.provenance)}
+        write_arrays(path, **self.weights, about=json.dumps(settings))
 
 
 def _sigmoid(values: Array) -> Array:
     """Return 1 / (1 + exp(-x)) for `values` x, in the same shape, without an overflow."""
-    half: Array = 0.5 + 0.5 * np.tanh(0.5 * values)
-    return half
+    activations: Array = 0.5 + 0.5 * np.tanh(0.5 * values)
+    return activations
