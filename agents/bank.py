@@ -97,9 +97,10 @@ def model_coefficients(time_constants: Array) -> tuple[Array, Array, Array, Arra
 class UndelayedModels:
     """Models of n plants with a gain of 1 and no delay, one model for each time constant.
 
-    The equation of the models is that of `model_coefficients`. The models start at rest.
+    The docstring of `model_coefficients` states the equation of the models. The models start at
+    rest.
 
-    The models run in NumPy or in PyTorch, through which gradients can pass.
+    The models run in NumPy, or in PyTorch so that gradients can pass through the models.
 
     Parameters
     ----------
@@ -171,7 +172,7 @@ class Bank:
     delay for the flows so far. The gain g of each model is estimated by recursive least squares
     on whitened signals, with the step test's gain as a prior. The probability of a model
     follows from its one-step errors, which are taken for Gaussian. Gains and probabilities
-    forget old samples exponentially, but never the prior.
+    forget old samples exponentially, but they never forget the prior.
 
     At each sample, call `observe` with the output, read the attributes, choose a flow, and call
     `apply` with the flow.

@@ -61,8 +61,8 @@ class DirectNNController(Controller):
 
     At each sample k, the controller takes steps A to E of Section 4 of the paper: the command
     is computed with the present weights, and then the weights are updated from the error e(k)
-    and the activations of the nodes. The only knowledge about the plant is D(G), the direction
-    in which the output moves when the input rises.
+    and the activations of the nodes. The controller knows only one thing about the plant: D(G),
+    the direction in which the output moves when the input rises.
 
     Parameters
     ----------
@@ -224,8 +224,7 @@ class DirectNNController(Controller):
     def _control(self, rows: Array) -> Array:
         """Return the commands u(k), t/h, shape (loops,), and update the weights.
 
-        The method takes steps A to E of Section 4 of the paper. `rows` are the observations,
-        shape (loops, size).
+        `rows` are the observations, shape (loops, size).
         """
         X = self.input_scale * np.ascontiguousarray(rows[:, : self.n_inputs].T)  # (N, batch)
         e = rows[:, self.error_index]
@@ -250,8 +249,8 @@ class DirectNNController(Controller):
 def _sum_of_rows(terms: Array) -> Array:
     """Return the sum of `terms` over the first axis, added one row after the other.
 
-    np.sum is not used, as the order of its additions can depend on the batch size. Then a
-    network in a batch would not equal a single network bit for bit.
+    With np.sum, the order of additions could depend on the batch size, and a network in a batch
+    would not equal a single network bit for bit.
     """
     total: Array = np.add.accumulate(terms, axis=0)[-1]
     return total

@@ -24,8 +24,8 @@ LOGISTIC: Final = 1.702
 class RandomSetpoint:
     """The distribution of a set point that changes at random, for n control loops.
 
-    The set point is piecewise constant. Its *levels*, the values between changes, are uniformly
-    distributed and independent, and the number of samples for which a level lasts is uniformly
+    The set point is piecewise constant. The values between changes, the *levels*, are uniformly
+    distributed and independent. The number of samples for which a level lasts is uniformly
     distributed. Each field is a number for all loops, or an array of shape (n,).
     """
 

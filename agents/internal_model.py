@@ -37,14 +37,14 @@ class InternalModelController(ModelBasedController):
 
     @property
     def _undelayed(self) -> Values:
-        """The output of the model if it had no delay, degC; shape (loops,), or () at first."""
+        """The output of the undelayed model, degC, shape (loops,), or () at first."""
         return self._outputs[-1]
 
     @property
     def _delayed(self) -> Values:
-        """The output of the model with its delay, degC; shape (loops,), or () at first.
+        """The output of the delayed model, degC, shape (loops,), or () at first.
 
-        If the model is right, a plant without noise and load has this output now.
+        If the model is right, this output equals the output of a plant without noise and load.
         """
         return self._outputs[0]
 

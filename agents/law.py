@@ -335,8 +335,8 @@ class Law:
     def _passable(self, wanted: Any) -> Any:
         """Return wanted flows after they are moved out of the dead zone and limited.
 
-        `wanted` and the result are shares of half the actuator's range, shape (n,). For the
-        gradients of PyTorch, the move out of the dead zone is a constant.
+        `wanted` and the returned flows are in units of half the actuator's range, shape (n,).
+        In PyTorch, the move out of the dead zone counts as a constant for gradients.
         """
         constant = wanted.detach() if self._xp is not np else wanted
         move = avoid_dead_zone(constant, self._edge, self._xp) - constant

@@ -42,9 +42,9 @@ ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
 def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.float64]:
     """Return the outputs of a feed-forward network, shape (..., outputs).
 
-    The network is computed in float32, as in its training. A matrix product of a batch adds
-    terms in another order than that of a single row, so the outputs for the same inputs can
-    differ by about 1e-6 between batch sizes.
+    The network is computed in float32, as in its training. The order of additions in a matrix
+    product depends on the batch size, so the outputs for the same inputs can differ by about
+    1e-6 between batch sizes.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def read_settings(file: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Increments:
-    """Settings of a network in velocity form, whose output changes a *wanted flow*.
+    """Settings of the velocity form, in which a network's output changes a *wanted flow*.
 
     The wanted flow is 0 at the start of an episode. The command follows from the wanted flow by
     a compensation of the actuator's dead zone.
@@ -193,8 +193,8 @@ class PolicyNetwork(Controller):
     The observation is multiplied by `input_scale` and passed through the layers. An activation
     follows every layer but the last layer, whose single output is clipped to [-1, 1]. The
     clipped output is the action or, with `increments`, changes a wanted flow. The layers are
-    computed in float32, so the actions of a loop in a batch can differ by rounding from those
-    of a single loop; see `forward`.
+    computed in float32, so the action for an observation can differ by rounding between a batch
+    and a single loop; see `forward`.
 
     The arguments `u_min` and `u_max` are those of `Controller`.
 

@@ -35,7 +35,7 @@ RESIDUAL, CARRIED, LOAD, GAIN = range(4)
 
 
 class OutputFilter:
-    """Kalman filters of the outputs of n plants; they differ in their assumptions on the load.
+    """Kalman filters of the outputs of n plants, with different assumptions on load and noise.
 
     The output is y(k) = g(k) s(k) + v(k), where g is the plant's gain, and s the output of the
     bank's mean model with gain 1 for the past flows. The residual v is the sum of noise and of
@@ -152,9 +152,9 @@ class OutputFilter:
         """Attribute a change of the mean model's past output to a load, in all states.
 
         The probabilities of the bank's models change with time, and then the mean model
-        explains more or less of a past output. The states change as if a load that has been
-        constant for long explained the difference. `changes` are the changes of s(k-1) in units
-        of the authority, and `poles` the slow poles of the mean models, both of shape (n,).
+        explains more or less of a past output. The states change as if a constant load
+        explained the difference. `changes` are the changes of s(k-1) in units of the authority,
+        and `poles` the slow poles of the mean models, both of shape (n,).
         """
         residuals = -self._states[:, :, GAIN] * changes
         self._states[:, :, RESIDUAL] += residuals
@@ -167,7 +167,8 @@ class OutputFilter:
         Parameters
         ----------
         poles
-            Slow poles of the mean models, shape (n,).
+            Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
+            (n,).
         noises
             Noise variances that the filters assume, in units of the authority squared, shape
             (filters, n).

@@ -1,4 +1,4 @@
-"""Implement PI controllers: that of Section 5 of the paper, and controllers tuned by a rule."""
+"""Implement the PI controller of Section 5 of the paper, and PI controllers tuned by a rule."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class PIController(Controller):
     ) -> PIController:
         """Return a controller tuned by the SIMC rule, with anti-windup.
 
-        The SIMC rule for PI controllers is that of S. Skogestad, "Simple analytic rules for
+        The SIMC rule for PI controllers was published by Skogestad, "Simple analytic rules for
         model reduction and PID controller tuning", Journal of Process Control 13, 2003,
         291-309, equations (23) and (24).
 
@@ -86,8 +86,8 @@ class PIController(Controller):
         delay
             theta, the plant's delay, s.
         closed_loop_time_constant
-            tau_c, the wanted time constant of the closed loop, s. The default is the delay,
-            which Skogestad recommends for "tight control with good robustness".
+            tau_c, the wanted time constant of the closed loop, s. Without this argument, tau_c
+            is the delay, as Skogestad recommends for "tight control with good robustness".
         sampling_interval
             Sampling interval, s.
         **arguments

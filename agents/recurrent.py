@@ -33,8 +33,8 @@ class RecurrentNetwork:
     The network corrects the control law of `agents.law`. Each layer after the recurrent unit
     also receives the network's inputs. Weights and biases are defined as those of
     `torch.nn.GRUCell` and `torch.nn.Linear`, in float32. The rows of the recurrent unit's
-    arrays belong to its reset gate, then its update gate, then its candidate state. The number
-    of nodes in the recurrent unit is `nodes`, and that in the hidden layer is `hidden`.
+    arrays belong to the reset gate, then the update gate, then the candidate state. The
+    recurrent unit has `nodes` nodes, and the hidden layer has `hidden` nodes.
     """
 
     input_weights: Array

@@ -65,8 +65,8 @@ TimeRange = Annotated[tuple[float, float] | None, _time_range]
 def _transport_delay(delay: float) -> int:
     """Return the transport delay d of equation (28) of the paper, samples.
 
-    `delay` is the delay d + 1 from a change of the flow to the first change of a sampled
-    output, in samples; it may be a fraction, and is rounded.
+    `delay` is the time d + 1 from a change of the flow to the first change of a sampled output,
+    in samples. A fraction is rounded.
     """
     return max(math.floor(delay + 0.5) - 1, 0)
 
@@ -78,9 +78,9 @@ class SelfTuningController(ModelBasedController):
     The controller has four parts:
 
     - A bank of models with different delays and time constants runs in parallel with the plant.
-      Each model is weighted by how well it predicts (D. T. Magill, "Optimal adaptive estimation
-      of sampled stochastic processes", IEEE Transactions on Automatic Control 10, 1965,
-      434-439). See `agents.bank`.
+      Each model is weighted by how well it predicts (Magill, "Optimal adaptive estimation of
+      sampled stochastic processes", IEEE Transactions on Automatic Control 10, 1965, 434-439).
+      See `agents.bank`.
     - Kalman filters estimate the gain of the plant and the load. See `agents.output_filter`.
     - If the set point is known to change at random, the target for the output lies between the
       set point and 0, as the set point may change before a flow shows. See `agents.hedge`.
@@ -101,8 +101,8 @@ class SelfTuningController(ModelBasedController):
         The greatest half width that the dead zone may have, t/h.
     delay_range
         Shortest and longest delay that the plant may have, s, defined as the argument `delay`.
-        All delays in this range are equally likely. By default, the plant's delay is between a
-        third and twice the argument `delay`, and likely to be near the argument.
+        All delays in this range are equally likely. By default, the delay is between a third of
+        `delay` and twice `delay`, and most likely near `delay`.
     setpoint_holds
         Shortest and longest time, s, for which the set point keeps a random level. All times in
         this range are equally likely. By default, nothing is known about changes of the set
@@ -243,8 +243,8 @@ class NeuralSelfTuningController(SelfTuningController):
     """A self-tuning controller whose control law is corrected by a trained recurrent network.
 
     The network was trained in advance, on many simulated plants, and does not learn online. The
-    network is computed in float32, so the commands of a loop in a batch can differ by rounding
-    from those of a single loop. The other parameters are those of `SelfTuningController`.
+    network is computed in float32, so the command for a loop can differ by rounding between a
+    batch and a single loop. The other parameters are those of `SelfTuningController`.
 
     Parameters
     ----------
