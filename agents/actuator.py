@@ -58,9 +58,10 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 
 
 def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
-    """Return commands after a move from the dead zone to its edge or to 0, whichever is nearer.
+    """Return commands none of which lies inside the dead zone, apart from 0.
 
-    A command outside the dead zone is returned as it is.
+    A command inside the dead zone is moved to the edge of the dead zone or to 0, whichever is
+    nearer. A command outside the dead zone is returned as it is.
 
     Parameters
     ----------

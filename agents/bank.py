@@ -229,11 +229,11 @@ class Bank:
         self._undelayed = UndelayedModels(self.time_constants)
         self._whiten_output = Whitening((self.n,))
         self._whiten_response = Whitening((constant_count, self.n))
-        # Past outputs s of the models without delay, and the whitened s, in a ring: sample k
-        # has the row k modulo the number of rows.
+        # Past outputs s of the models without delay, and the whitened s, as two elements of the
+        # second axis. The first axis is a ring: sample k has the row k modulo the length.
         ring_shape = (int(self._shortest_delays.max()) + 1, 2, constant_count, self.n)
         self._ring = np.zeros(ring_shape, np.float32)
-        # Outputs s(k - d), newest first: the shortest delay, and then longer delays.
+        # Outputs s(k - d) for the shortest delay d, and then for longer delays.
         delayed_shape = (self._delay_count + LAGS - 1, constant_count, self.n)
         self._delayed = np.zeros(delayed_shape, np.float32)
         # The whitened s(k - d) of each model.

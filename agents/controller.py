@@ -195,8 +195,9 @@ class Controller(ABC):
     def reset(self) -> None:
         """Forget the past samples before a new episode, but keep learnt weights."""
         self.command = np.float64(0.0)
-        # Shape of the loops since `reset`, () or (batch,); None before the first sample.
-        self._loops_before: tuple[int, ...] | None = None
+        # Shape of the commands since `reset`: () for one loop, (batch,) for a batch, and None
+        # before the first sample.
+        self._loop_shape: tuple[int, ...] | None = None
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the controller was not made for, as their scores would be wrong.
@@ -275,16 +276,17 @@ class Controller(ABC):
             )
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")
-        loops = values.shape[:-1]
-        if self._loops_before not in (None, loops):
+        loop_shape = values.shape[:-1]
+        if self._loop_shape not in (None, loop_shape):
             raise ValueError(
-                f"observation must have shape {(*self._loops_before, self.n_obs)}, for the "
+                f"observation must have shape {(*self._loop_shape, self.n_obs)}, for the "
                 f"loops since reset or for num_envs loops, got {values.shape}"
             )
         commands = self._control(np.atleast_2d(values))
-        self.command = commands if loops else commands[0]
+        is_batch = loop_shape != ()
+        self.command = commands if is_batch else commands[0]
         if self._remembers:
-            self._loops_before = loops
+            self._loop_shape = loop_shape
         return float32_action(self.command, self.u_min, self.u_max, self._edge)[..., np.newaxis]
 
     @abstractmethod

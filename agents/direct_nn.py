@@ -218,7 +218,7 @@ class DirectNNController(Controller):
     def reset(self) -> None:
         """Begin a new episode, but keep the weights that were learnt."""
         super().reset()
-        self._loops_before = self._batch_shape
+        self._loop_shape = self._batch_shape
         self._sample = 0  # k
 
     def _control(self, rows: Array) -> Array:

@@ -56,9 +56,10 @@ def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.fl
         Inputs of the network, shape (..., inputs).
     """
     x = np.asarray(inputs, np.float32)
-    *hidden, (last_W, last_b) = layers
-    for W, b in hidden:
-        x = ACTIVATIONS[activation](x @ W.T + b)
+    activate = ACTIVATIONS[activation]
+    *hidden_layers, (last_W, last_b) = layers
+    for W, b in hidden_layers:
+        x = activate(x @ W.T + b)
     return (x @ last_W.T + last_b).astype(np.float64)
 
 

@@ -101,6 +101,7 @@ class OutputFilter:
             Variances of the bank's one-step errors, in units of the authority squared, shape
             (n,).
         """
+        # Responses of the past change if the bank has changed the mean model.
         response, last_response = responses
         self._attribute_to_load(last_response - self._response, poles)
         self._response = response
@@ -110,17 +111,19 @@ class OutputFilter:
         states = np.einsum("nij,fnj->fni", transition, self._states)
         covariances = transition @ self._covariances @ transition.transpose(0, 2, 1)
         covariances = covariances + disturbances
-        # Predict the output, which is the sum of the residual and of gain times response.
-        # `effects` are the covariances of the states and the output.
+        # Predict the output: the sum of the residual and of gain times response. The cross
+        # covariances are the covariances between the states and the output.
         of_gain = response[:, np.newaxis] * covariances[:, :, :, GAIN]
-        effects = covariances[:, :, :, RESIDUAL] + of_gain
-        error_variances = effects[:, :, RESIDUAL] + response * effects[:, :, GAIN]
+        cross_covariances = covariances[:, :, :, RESIDUAL] + of_gain
+        error_variances = (
+            cross_covariances[:, :, RESIDUAL] + response * cross_covariances[:, :, GAIN]
+        )
         error_variances = error_variances + READING_SHARE * noises
         errors = output - states[:, :, RESIDUAL] - response * states[:, :, GAIN]
         # Correct the states by the errors of the predicted outputs.
-        corrections = effects / error_variances[:, :, np.newaxis]
+        corrections = cross_covariances / error_variances[:, :, np.newaxis]
         self._states = states + corrections * errors[:, :, np.newaxis]
-        products = corrections[:, :, :, np.newaxis] * effects[:, :, np.newaxis, :]
+        products = corrections[:, :, :, np.newaxis] * cross_covariances[:, :, np.newaxis, :]
         self._covariances = covariances - products
         self._average(errors, error_variances)
 
@@ -143,6 +146,8 @@ class OutputFilter:
         """
         residual = self._mean_state[RESIDUAL]
         carried = self._mean_state[CARRIED]
+        # The slow part of v, from the partial fractions of the two poles, and its value after a
+        # long time with the present load.
         slow = (poles * residual + carried) / (poles - FAST_POLE)
         slow_of_load = self.load * poles * (1.0 - FAST_POLE) / (poles - FAST_POLE)
         forecasts: Array = self.load + fading * (slow - slow_of_load)

@@ -58,7 +58,9 @@ class RecurrentNetwork:
     """How the network was trained, for the network's file; JSON-serialisable."""
 
     def __post_init__(self) -> None:
-        nodes, hidden = np.shape(self.state_weights)[-1], np.size(self.hidden_biases)
+        """Replace the arrays by float32 copies; raise a ValueError if a shape does not fit."""
+        nodes = np.shape(self.state_weights)[-1]
+        hidden = np.size(self.hidden_biases)
         shapes = {
             "input_weights": (3 * nodes, INPUTS),
             "input_biases": (3 * nodes,),
@@ -70,7 +72,8 @@ class RecurrentNetwork:
             "output_biases": (OUTPUTS,),
         }
         for name, shape in shapes.items():
-            object.__setattr__(self, name, check_array(name, getattr(self, name), shape))
+            array = check_array(name, getattr(self, name), shape)
+            object.__setattr__(self, name, array)  # as the dataclass is frozen
 
     @property
     def weights(self) -> dict[str, Array]:

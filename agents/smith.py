@@ -101,8 +101,9 @@ class SmithPredictor(InternalModelController):
         """
         in_transit = self._undelayed - self._delayed
         error = rows[:, self.error_index] - in_transit
-        gain = self.kp + self.ki  # the sum includes the present error
+        gain = self.kp + self.ki  # of the present error, which the sum of errors includes
         wanted = self._integral - gain * error
-        within = np.clip(wanted, self.u_min, self.u_max)
-        self._integral = self._integral + self.ki / gain * (within - self._integral)
+        # Anti-windup: the integral follows the limited flow, and not the wanted flow.
+        limited = np.clip(wanted, self.u_min, self.u_max)
+        self._integral = self._integral + self.ki / gain * (limited - self._integral)
         return self._command(wanted)
