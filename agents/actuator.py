@@ -27,7 +27,7 @@ def applied_flow(command: Any, dead_zone: Any, u_min: Any, u_max: Any) -> Array:
 
 
 def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
-    """Scale commands to normalised float32 actions: -1 at `u_min` and 1 at `u_max`.
+    """Return the normalised float32 actions for commands: -1 at `u_min` and 1 at `u_max`.
 
     Rounding to float32 can move a command from the edge of the dead zone to the inside of the
     dead zone, where a command has no effect. An action that was moved inside by rounding is
@@ -58,9 +58,10 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 
 
 def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
-    """Move commands inside the dead zone to its edge or to 0, whichever is nearer.
+    """Return commands none of which lies inside the dead zone, apart from 0.
 
-    The moved commands are returned, and a command outside the dead zone stays as it is.
+    A command inside the dead zone is moved to the edge of the dead zone or to 0, whichever is
+    nearer. A command outside the dead zone is returned as it is.
 
     Parameters
     ----------

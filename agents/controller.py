@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from numbers import Integral, Real
-from typing import Annotated, Any, Final, NoReturn, get_type_hints
+from typing import Annotated, Any, Final, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,29 +19,26 @@ from agents.actuator import float32_action
 # set points and the latest three errors.
 PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
-# Largest number of nodes, loops, array elements or samples of delay that is accepted. A larger
-# argument is a typing error, and could exhaust the memory.
-MOST = 1_000_000
+# Largest number of nodes, loops or samples of delay that is accepted. A larger number is a
+# typing error, and could exhaust the memory.
+LARGEST_SIZE = 1_000_000
 
 Validator = Callable[[str, Any], Any]
 
 
-def _reject(name: str, value: Any, allowed: str) -> NoReturn:
-    """Raise a ValueError that says what the argument `name` must be, and its `value`.
+def _require(is_allowed: bool, name: str, value: Any, allowed: str) -> None:
+    """Raise a ValueError unless `is_allowed`: the argument `name` must be `allowed`.
 
-    `allowed` describes the allowed values in words, such as "a finite number".
+    `allowed` describes the allowed values in words, such as "a finite number", and the message
+    shows the argument's `value`.
     """
-    raise ValueError(f"{name} must be {allowed}, got {value!r}")
+    if not is_allowed:
+        raise ValueError(f"{name} must be {allowed}, got {value!r}")
 
 
-def _is_real(value: Any) -> bool:
-    """Return whether a value is a real number, NaN and infinity included, but not a bool."""
-    return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
-
-
-def _is_integer(value: Any) -> bool:
-    """Return whether a value is an integer of Python or NumPy, but not a bool."""
-    return isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
+def _is_number(value: Any, kind: type[Any]) -> bool:
+    """Return whether a value is a number of a kind, `Real` or `Integral`, but not a bool."""
+    return isinstance(value, kind) and not isinstance(value, bool | np.bool_)
 
 
 # The following functions validate an argument: `name` is the argument's name, for the message.
@@ -50,58 +47,57 @@ def _is_integer(value: Any) -> bool:
 
 
 def finite(name: str, value: Any) -> float:
-    """Return the argument `value` as a float; raise a ValueError unless it is finite."""
-    if not (_is_real(value) and math.isfinite(value)):
-        _reject(name, value, "a finite number")
+    """Return `value` as a float; raise a ValueError unless it is a finite number."""
+    is_allowed = _is_number(value, Real) and math.isfinite(value)
+    _require(is_allowed, name, value, "a finite number")
     return float(value)
 
 
 def not_negative(name: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is finite and at least 0."""
-    if not (_is_real(value) and 0.0 <= value < math.inf):
-        _reject(name, value, "a finite number of at least 0")
+    is_allowed = _is_number(value, Real) and 0.0 <= value < math.inf
+    _require(is_allowed, name, value, "a finite number of at least 0")
     return float(value)
 
 
 def positive(name: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is finite and above 0."""
-    if not (_is_real(value) and 0.0 < value < math.inf):
-        _reject(name, value, "a finite number above 0")
+    is_allowed = _is_number(value, Real) and 0.0 < value < math.inf
+    _require(is_allowed, name, value, "a finite number above 0")
     return float(value)
 
 
 def nonzero(name: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is finite and not 0."""
-    if not (_is_real(value) and 0.0 < abs(value) < math.inf):
-        _reject(name, value, "a finite number other than 0")
+    is_allowed = _is_number(value, Real) and 0.0 < abs(value) < math.inf
+    _require(is_allowed, name, value, "a finite number other than 0")
     return float(value)
 
 
 def flag(name: str, value: Any) -> bool:
     """Return `value` as a bool; raise a ValueError unless it is True or False."""
-    if not isinstance(value, bool | np.bool_):
-        _reject(name, value, "True or False")
+    _require(isinstance(value, bool | np.bool_), name, value, "True or False")
     return bool(value)
 
 
 def integer_from_0(name: str, value: Any) -> int:
     """Return `value` as an int; raise a ValueError unless it is an integer of at least 0."""
-    if not (_is_integer(value) and value >= 0):
-        _reject(name, value, "an integer of at least 0")
+    is_allowed = _is_number(value, Integral) and value >= 0
+    _require(is_allowed, name, value, "an integer of at least 0")
     return int(value)
 
 
 def integer_from_1(name: str, value: Any) -> int:
     """Return `value` as an int; raise a ValueError unless it is an integer of at least 1."""
-    if not (_is_integer(value) and value >= 1):
-        _reject(name, value, "an integer of at least 1")
+    is_allowed = _is_number(value, Integral) and value >= 1
+    _require(is_allowed, name, value, "an integer of at least 1")
     return int(value)
 
 
-def integer_to_most(name: str, value: Any) -> int:
-    """Return `value` as an int; raise a ValueError unless it is an integer from 1 to `MOST`."""
-    if not (_is_integer(value) and 1 <= value <= MOST):
-        _reject(name, value, f"an integer from 1 to {MOST:,}")
+def array_size(name: str, value: Any) -> int:
+    """Return `value` as an int; raise a ValueError unless it is from 1 to `LARGEST_SIZE`."""
+    is_allowed = _is_number(value, Integral) and 1 <= value <= LARGEST_SIZE
+    _require(is_allowed, name, value, f"an integer from 1 to {LARGEST_SIZE:,}")
     return int(value)
 
 
@@ -114,28 +110,7 @@ Gain = Annotated[float, nonzero]
 Flag = Annotated[bool, flag]
 Index = Annotated[int, integer_from_0]
 Count = Annotated[int, integer_from_1]
-Size = Annotated[int, integer_to_most]
-
-
-def check(name: str, value: Any, annotation: Any) -> Any:
-    """Return a value as the validator of an annotated type converts it.
-
-    Parameters
-    ----------
-    name
-        Name of the argument, for the message of an error.
-    value
-        The value to check.
-    annotation
-        A type with a validator, such as `Positive`.
-
-    Raises
-    ------
-    ValueError
-        If the validator rejects the value.
-    """
-    (validator,) = annotation.__metadata__
-    return validator(name, value)
+Size = Annotated[int, array_size]
 
 
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
@@ -154,17 +129,14 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 @cache  # as reading the annotations is slow
-def _validated_fields(controller: type) -> dict[str, Any]:
-    """Return the types of those fields of a controller class that carry a validator.
-
-    The keys are the names of the fields, and a value is a type such as `Positive`.
-    """
+def _validators(controller: type) -> dict[str, Validator]:
+    """Return the validators of a controller's fields by the names of the fields."""
     annotations = get_type_hints(controller, include_extras=True)
-    return {
-        name: annotation
-        for name, annotation in annotations.items()
-        if hasattr(annotation, "__metadata__")
-    }
+    validators = {}
+    for name, annotation in annotations.items():
+        if hasattr(annotation, "__metadata__"):  # an `Annotated` type such as `Positive`
+            validators[name] = annotation.__metadata__[0]
+    return validators
 
 
 @dataclass(eq=False, kw_only=True)
@@ -214,8 +186,8 @@ class Controller(ABC):
         A subclass calls this method first, and then sets the attributes that its `reset` does
         not use.
         """
-        for name, annotation in _validated_fields(type(self)).items():
-            setattr(self, name, check(name, getattr(self, name), annotation))
+        for name, validator in _validators(type(self)).items():
+            setattr(self, name, validator(name, getattr(self, name)))
         if self.u_min >= self.u_max:
             raise ValueError(f"u_min must be below u_max = {self.u_max!r}, got {self.u_min!r}")
         self.reset()
@@ -223,8 +195,9 @@ class Controller(ABC):
     def reset(self) -> None:
         """Forget the past samples before a new episode, but keep learnt weights."""
         self.command = np.float64(0.0)
-        # Shape of the loops since `reset`, () or (batch,); None before the first sample.
-        self._loops_before: tuple[int, ...] | None = None
+        # Shape of the commands since `reset`: () for one loop, (batch,) for a batch, and None
+        # before the first sample.
+        self._loop_shape: tuple[int, ...] | None = None
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the controller was not made for, as their scores would be wrong.
@@ -256,18 +229,18 @@ class Controller(ABC):
                 f"policy must be made with the limits of env, u_min={limits[0]}, "
                 f"u_max={limits[1]}, got {self.u_min}, {self.u_max}"
             )
-        place = 0  # of the signal's newest sample in the observation
+        first = 0  # index of the signal's newest sample in the observation
         for signal in ("setpoint", "error"):
             window = getattr(parameters, f"{signal}_window")
             # None if the controller does not read this element alone.
             index = getattr(self, f"{signal}_index", None)
-            if index is not None and (index != place or not window):
+            if index is not None and (index != first or not window):
                 raise ValueError(
                     f"env must show its newest {signal} as element {index} of the observation, "
                     f"where policy reads it, got setpoint_window={parameters.setpoint_window}, "
                     f"error_window={parameters.error_window}"
                 )
-            place += window
+            first += window
         if wrapped:
             raise ValueError(
                 f"env must not be wrapped, as policy commands the flow itself, got {wrapped}"
@@ -303,16 +276,17 @@ class Controller(ABC):
             )
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")
-        loops = values.shape[:-1]
-        if self._loops_before not in (None, loops):
+        loop_shape = values.shape[:-1]
+        if self._loop_shape not in (None, loop_shape):
             raise ValueError(
-                f"observation must have shape {(*self._loops_before, self.n_obs)}, that of the "
-                f"loops since reset or of num_envs, got {values.shape}"
+                f"observation must have shape {(*self._loop_shape, self.n_obs)}, for the "
+                f"loops since reset or for num_envs loops, got {values.shape}"
             )
         commands = self._control(np.atleast_2d(values))
-        self.command = commands if loops else commands[0]
+        is_batch = loop_shape != ()
+        self.command = commands if is_batch else commands[0]
         if self._remembers:
-            self._loops_before = loops
+            self._loop_shape = loop_shape
         return float32_action(self.command, self.u_min, self.u_max, self._edge)[..., np.newaxis]
 
     @abstractmethod
@@ -355,9 +329,9 @@ class ModelBasedController(Controller):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._delay_samples = self.delay / self.sampling_interval
-        if self._delay_samples > MOST:
+        self._edge = self.dead_zone
+        if self.delay / self.sampling_interval > LARGEST_SIZE:
             raise ValueError(
-                f"delay must be at most {MOST:,} times sampling_interval = "
+                f"delay must be at most {LARGEST_SIZE:,} times sampling_interval = "
                 f"{self.sampling_interval!r}, got {self.delay!r}"
             )

@@ -19,10 +19,10 @@ Array = NDArray[np.float64]
 class DahlinController(InternalModelController):
     """A controller that makes the output approach the set point like a first-order lag.
 
-    The controller was published by E. B. Dahlin, "Designing and tuning digital controllers",
-    Instruments and Control Systems 41 (6), 1968, 77-83, written as internal model control (M.
-    Morari and E. Zafiriou, "Robust Process Control", 1989, chapter 3). Let h be the sampling
-    interval, g = 1 - exp(-h / lambda) and f = 1 - exp(-h / T_f):
+    The controller is that of Dahlin, "Designing and tuning digital controllers", Instruments
+    and Control Systems 41 (6), 1968, 77-83, written as internal model control (Morari and
+    Zafiriou, "Robust Process Control", 1989, chapter 3). With the sampling interval h, the
+    factors below are g = 1 - exp(-h / lambda) and f = 1 - exp(-h / T_f).
 
     - A first-order model, x(k+1) = p x(k) + b u_a(k), runs in parallel with the plant, where
       u_a is the flow that the actuator passes. With the delay of d samples, the model predicts
@@ -42,8 +42,8 @@ class DahlinController(InternalModelController):
     ----------
     closed_loop_time_constant
         lambda, time constant of the response to a step of the set point, s. With a large
-        lambda, the commands for small errors stay inside the dead zone and have no effect. Then
-        errors up to 0.5 |gain| dead_zone lambda / time_constant, degC, are not corrected.
+        lambda, the commands for small errors stay inside the dead zone and have no effect.
+        Errors up to 0.5 |gain| dead_zone lambda / time_constant, degC, are then not corrected.
     filter_time_constant
         T_f, time constant of the low-pass filter of the disturbance, s; 0 for no filter, as in
         Dahlin's paper. A larger T_f makes the loop more robust, and does not change the
@@ -97,8 +97,6 @@ class DahlinController(InternalModelController):
         output = setpoint - rows[:, self.error_index]
         residual = output - self._delayed
         self._disturbance = self._disturbance + self._filter * (residual - self._disturbance)
-        now = self._undelayed
-        move = self._approach * (setpoint - self._disturbance - now)
-        command = self._passable(((1.0 - self._pole) * now + move) / self._input_gain)
-        self._advance(command)
-        return command
+        state = self._undelayed
+        move = self._approach * (setpoint - self._disturbance - state)
+        return self._command(((1.0 - self._pole) * state + move) / self._input_gain)

@@ -17,9 +17,9 @@ from agents.controller import (
     NotNegative,
     Number,
     Size,
-    check,
+    array_size,
 )
-from agents.networks import check_array, reading, write
+from agents.networks import check_array, open_arrays, write_arrays
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class Weights:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the weights to the `.npz` file `path`, which `load` reads."""
-        write(path, {}, **vars(self))
+        write_arrays(path, **vars(self))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Weights:
@@ -51,7 +51,7 @@ class Weights:
 
         A ValueError is raised if the file is damaged or holds something else.
         """
-        with reading(path, "weights") as file:
+        with open_arrays(path, "weights") as file:
             return cls(**{field.name: file[field.name] for field in fields(cls)})
 
 
@@ -61,8 +61,8 @@ class DirectNNController(Controller):
 
     At each sample k, the controller takes steps A to E of Section 4 of the paper: the command
     is computed with the present weights, and then the weights are updated from the error e(k)
-    and the activations of the nodes. The only knowledge about the plant is D(G), the direction
-    in which the output moves when the input rises.
+    and the activations of the nodes. The controller knows only one thing about the plant: D(G),
+    the direction in which the output moves when the input rises.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class DirectNNController(Controller):
         if abs(self.direction) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
         if self.num_envs is not None:
-            check("num_envs", self.num_envs, Size)
+            array_size("num_envs", self.num_envs)
         self.n_obs = max(self.n_inputs, self.error_index + 1)
         # Shapes of one network's weights.
         self._shapes = {
@@ -218,14 +218,13 @@ class DirectNNController(Controller):
     def reset(self) -> None:
         """Begin a new episode, but keep the weights that were learnt."""
         super().reset()
-        self._loops_before = self._batch_shape
+        self._loop_shape = self._batch_shape
         self._sample = 0  # k
 
     def _control(self, rows: Array) -> Array:
         """Return the commands u(k), t/h, shape (loops,), and update the weights.
 
-        The method takes steps A to E of Section 4 of the paper. `rows` are the observations,
-        shape (loops, size).
+        `rows` are the observations, shape (loops, size).
         """
         X = self.input_scale * np.ascontiguousarray(rows[:, : self.n_inputs].T)  # (N, batch)
         e = rows[:, self.error_index]
@@ -250,8 +249,8 @@ class DirectNNController(Controller):
 def _sum_of_rows(terms: Array) -> Array:
     """Return the sum of `terms` over the first axis, added one row after the other.
 
-    np.sum is not used, as the order of its additions can depend on the batch size. Then a
-    network in a batch would not equal a single network bit for bit.
+    With np.sum, the order of additions could depend on the batch size, and a network in a batch
+    would not equal a single network bit for bit.
     """
     total: Array = np.add.accumulate(terms, axis=0)[-1]
     return total

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 
-BISECTIONS: Final = 10  # 2^-10: they find a target to a thousandth of the set point
+BISECTIONS: Final = 10  # enough to find a target to 2^-10, a thousandth, of the set point
 # The logistic function of LOGISTIC x is within 0.01 of the standard normal distribution of x.
 LOGISTIC: Final = 1.702
 
@@ -24,8 +24,8 @@ LOGISTIC: Final = 1.702
 class RandomSetpoint:
     """The distribution of a set point that changes at random, for n control loops.
 
-    The set point is piecewise constant. Its *levels*, the values between changes, are uniformly
-    distributed and independent, and the number of samples for which a level lasts is uniformly
+    The set point is piecewise constant. The values between changes, the *levels*, are uniformly
+    distributed and independent. The number of samples for which a level lasts is uniformly
     distributed. Each field is a number for all loops, or an array of shape (n,).
     """
 
@@ -38,19 +38,26 @@ class RandomSetpoint:
     `-amplitude`."""
 
     def probability_held(self, ages: Array, ahead: Array) -> Array:
-        """Return the probability that the set point does not change soon, shape (n,).
+        """Return the probability that the set point keeps its level for some more samples.
 
         Parameters
         ----------
         ages
             Number of samples since the last change of the set point, shape (n,).
         ahead
-            Number of future samples within which the set point shall not change, shape (n,).
+            Number of future samples for which the set point shall keep its level, shape (n,).
+
+        Returns
+        -------
+        ndarray
+            Shape (n,).
         """
-        lengths = self.longest - self.shortest + 1.0
-        later = np.clip((self.longest - ages - ahead) / lengths, 0.0, 1.0)
-        present = np.clip((self.longest - ages) / lengths, 1e-9, 1.0)
-        probability: Array = later / present
+        durations = self.longest - self.shortest + 1.0  # number of the possible durations
+        # Shares of the possible durations of the level that are longer than its age, now and
+        # `ahead` samples later. The least share keeps the divisor from 0.
+        share_now = np.clip((self.longest - ages) / durations, 1e-9, 1.0)
+        share_later = np.clip((self.longest - ages - ahead) / durations, 0.0, 1.0)
+        probability: Array = share_later / share_now
         return probability
 
     def targets(self, setpoints: Array, held: Array, deviations: Array) -> Array:

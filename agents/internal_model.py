@@ -25,44 +25,38 @@ class InternalModelController(ModelBasedController):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._edge = self.dead_zone
         self._pole = math.exp(-self.sampling_interval / self.time_constant)
         self._input_gain = self.gain * (1.0 - self._pole)  # degC per t/h and sample
-        self._delay = max(round(self._delay_samples), 1)
+        self._delay = max(round(self.delay / self.sampling_interval), 1)  # samples
 
     def reset(self) -> None:
-        """Set the model's outputs to 0, as for a plant at rest, before a new episode."""
+        """Set the model's output to 0, as for a plant at rest, before a new episode."""
         super().reset()
-        self._outputs: list[Values] = []  # of the undelayed model, degC; the newest is last
+        # Outputs of the undelayed model within the delay, degC; the newest is last.
+        self._outputs: list[Values] = [np.float64(0.0)]
 
     @property
     def _undelayed(self) -> Values:
-        """The output of the model if it had no delay, degC; shape (loops,), or () at first."""
-        return self._outputs[-1] if self._outputs else np.float64(0.0)
+        """The output of the undelayed model, degC, shape (loops,), or () at first."""
+        return self._outputs[-1]
 
     @property
     def _delayed(self) -> Values:
-        """The output of the model with its delay, degC; shape (loops,), or () at first.
+        """The output of the delayed model, degC, shape (loops,), or () at first.
 
-        If the model is right, a plant without noise and load has this output now.
+        If the model is right, this output equals the output of a plant without noise and load.
         """
-        return self._outputs[0] if self._outputs else np.float64(0.0)
+        return self._outputs[0]
 
-    def _passable(self, command: Array) -> Array:
-        """Return commands of which none lies inside the dead zone, t/h, shape (loops,).
+    def _command(self, wanted: Array) -> Array:
+        """Return the commands for wanted flows, and advance the model by a sample.
 
-        `command` are the wanted flows, t/h, shape (loops,). A wanted flow inside the dead zone
-        is moved to 0 or to the edge of the dead zone, whichever is nearer.
+        A wanted flow inside the dead zone is moved to 0 or to the edge of the dead zone,
+        whichever is nearer. The wanted flows and the commands are in t/h, shape (loops,).
         """
-        passable: Array = avoid_dead_zone(command, self.dead_zone)
-        return passable
-
-    def _advance(self, command: Array) -> None:
-        """Advance the model by a sample, with the flow that the actuator passes.
-
-        `_control` calls this method with its final commands, t/h, shape (loops,).
-        """
+        command: Array = avoid_dead_zone(wanted, self.dead_zone)
         applied = applied_flow(command, self.dead_zone, self.u_min, self.u_max)
-        outputs = self._outputs or [np.float64(0.0)] * self._delay
-        newest = self._pole * outputs[-1] + self._input_gain * applied
-        self._outputs = [*outputs[1:], newest]
+        self._outputs.append(self._pole * self._undelayed + self._input_gain * applied)
+        if len(self._outputs) > self._delay:
+            del self._outputs[0]
+        return command

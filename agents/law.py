@@ -19,23 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.actuator import avoid_dead_zone
-from agents.bank import LAGS, LEAST_NOISE, Bank, Estimate, second_order
+from agents.bank import LAGS, LEAST_NOISE, Bank, UndelayedModels
 from agents.hedge import RandomSetpoint
 from agents.output_filter import LOAD_CHANGES, OutputFilter
 
 Array = NDArray[np.floating[Any]]
 
 SHARE: Final = 0.5  # share of the way to the target that one sample covers, without a network
-# Standard deviation of the error of a forecast over the delay, divided by that of the noise.
+# Standard deviation of the error of a forecast over the delay, as a multiple of the standard
+# deviation of the noise.
 FORECAST_SPREAD: Final = 1.2
 REACTION: Final = 2.0  # samples that the output takes, after the delay, to follow a flow
-# Signals of a network are limited to this multiple of the noise, as larger ones are outliers.
-OUTLIER: Final = 12.0
-# Added to the noise before signals are divided by the noise, of the authority, so that tiny
-# model errors are not taken for signals where there is hardly any noise.
-DOUBT: Final = 0.002
-# A typical delay, samples, and a typical natural logarithm of a time constant in samples: those
-# of the plant, equation (28) of the paper. They centre the inputs of a network.
+# Errors that are inputs of a network are limited to this multiple of the noise, as larger
+# errors are outliers.
+LARGEST_ERROR: Final = 12.0
+# Added to the standard deviation of the noise, in units of the authority. Without it, tiny
+# errors of the models would count as signals where there is hardly any noise.
+MODEL_ERROR: Final = 0.002
+# Delay, samples, and natural logarithm of the time constant in samples, of the paper's plant,
+# equation (28). They centre the inputs of a network.
 TYPICAL_DELAY: Final = 18.0
 TYPICAL_LOG_CONSTANT: Final = 3.0
 
@@ -54,18 +56,21 @@ class Situation:
     """The knowledge about n control loops at a sample, by which flows are chosen."""
 
     targets: Array
-    """Target of the mean model's output at the time when the present flow shows, of the
-    authority, shape (n,): the hedged set point (see `agents.hedge`) minus the forecast of the
-    part of the output that the models do not explain."""
-    estimate: Estimate
-    """The bank's estimates of delays and time constants."""
+    """Target of the mean model's output at the time when the present flow shows, in units of
+    the authority, shape (n,): the hedged set point (see `agents.hedge`) minus the forecast of
+    the part of the output that the models do not explain."""
+    shares: Array
+    """Probabilities of the bank's time constants, shape (time constants, n)."""
+    pole: Array
+    """Pole of the mean model: the mean of exp(-1 / T) over the bank's time constants T in
+    samples, shape (n,)."""
     gain: Array
     """Estimated gain of the plant, as a multiple of the step test's gain, shape (n,)."""
     gain_spread: Array
     """Standard deviation of `gain`, shape (n,)."""
     noise: Array
-    """Standard deviation of the bank's one-step errors, plus `DOUBT`, of the authority, shape
-    (n,)."""
+    """Standard deviation of the bank's one-step errors, plus `MODEL_ERROR`, in units of the
+    authority, shape (n,)."""
     inputs: Array
     """Inputs of a network that come from the observer, shape (n, PAST_INPUTS)."""
 
@@ -73,7 +78,7 @@ class Situation:
 class Observer:
     """The memory of n control loops: bank of models, Kalman filters, and age of the set point.
 
-    The observer uses NumPy alone, so no gradient of PyTorch passes through the observer.
+    The observer uses NumPy alone, so no gradient of PyTorch passes through it.
 
     Parameters
     ----------
@@ -85,13 +90,11 @@ class Observer:
     limits
         Lowest and highest flow, as shares of half the actuator's range, each of shape (n,).
     setpoint
-        The distribution of random set points, with amplitudes as shares of the authority; None
-        if nothing is known about changes of the set points.
+        The distribution of random set points, in units of the authority; None if nothing is
+        known about changes of the set points.
 
     Attributes
     ----------
-    bank : Bank
-        The bank of models.
     filter : OutputFilter
         The Kalman filters of gain and load.
     """
@@ -103,13 +106,13 @@ class Observer:
         limits: tuple[Array, Array],
         setpoint: RandomSetpoint | None = None,
     ) -> None:
-        self.bank = bank
         self.filter = OutputFilter(bank.gain_spread)
+        self._bank = bank
         self._edge = edge
         self._centre = (limits[0] + limits[1]) / 2.0
-        self._random = setpoint
-        self._age: Array = np.zeros(bank.n)  # samples since the set point changed
+        self._random_setpoint = setpoint
         self._setpoint: Array | None = None
+        self._age: Array = np.zeros(bank.n)  # samples since the set point changed
         self._k = 0
 
     def observe(self, setpoint: Array, output: Array) -> Situation:
@@ -120,82 +123,100 @@ class Observer:
         Parameters
         ----------
         setpoint
-            Set points y_d(k), of the authority, shape (n,).
+            Set points y_d(k), in units of the authority (see `agents.bank`), shape (n,).
         output
-            Measured outputs y(k), of the authority, shape (n,).
+            Measured outputs y(k), in units of the authority, shape (n,).
         """
-        bank = self.bank
+        bank = self._bank
         bank.observe(output)
-        estimate = bank.estimate
-        self.filter.update(output, bank.responses[:2], estimate.pole, bank.variance)
-        forecast = self.filter.forecast(estimate.pole, estimate.fading)
-        if self._setpoint is None:
-            self._setpoint = setpoint
-        self._age = np.where(setpoint == self._setpoint, self._age + 1.0, 0.0)
+        self.filter.update(output, bank.responses[:2], bank.pole, bank.variance)
+        forecast = self.filter.forecast(bank.pole, bank.fading)
+        # At the first sample, the set point counts as unchanged.
+        is_unchanged = self._setpoint is None or setpoint == self._setpoint
+        self._age = np.where(is_unchanged, self._age + 1.0, 0.0)
         self._setpoint = setpoint
+        deviation = np.sqrt(bank.variance)
         held: Array = np.ones(bank.n)
         aim = setpoint
-        if self._random is not None:
-            held = self._random.probability_held(self._age, estimate.delay + 1.0 + REACTION)
-            aim = self._random.targets(setpoint, held, FORECAST_SPREAD * bank.noise)
-        noise = bank.noise + DOUBT
-        inputs = self._inputs(output, aim, held, forecast, noise)
+        if self._random_setpoint is not None:
+            ahead = bank.delay + 1.0 + REACTION
+            held = self._random_setpoint.probability_held(self._age, ahead)
+            aim = self._random_setpoint.targets(setpoint, held, FORECAST_SPREAD * deviation)
+        noise = deviation + MODEL_ERROR
+        inputs = self._inputs(setpoint, output, aim, held, forecast, noise)
         self._k += 1
-        targets = (aim - forecast).astype(np.float32)
-        gain = self.filter.gain.astype(np.float32)
-        gain_spread = self.filter.gain_spread.astype(np.float32)
-        return Situation(targets, estimate, gain, gain_spread, noise, inputs)
+        return Situation(
+            targets=(aim - forecast).astype(np.float32),
+            shares=bank.shares,
+            pole=bank.pole,
+            gain=self.filter.gain.astype(np.float32),
+            gain_spread=self.filter.gain_spread.astype(np.float32),
+            noise=noise,
+            inputs=inputs,
+        )
 
     def _inputs(
-        self, output: Array, aim: Array, held: Array, forecast: Array, noise: Array
+        self,
+        setpoint: Array,
+        output: Array,
+        aim: Array,
+        held: Array,
+        forecast: Array,
+        noise: Array,
     ) -> Array:
         """Return the observer's inputs of a network, scaled to be of order 1.
 
         Parameters
         ----------
+        setpoint
+            Set points y_d(k), in units of the authority (see `agents.bank`), shape (n,).
         output
-            Measured outputs y(k), of the authority, shape (n,).
+            Measured outputs y(k), in units of the authority, shape (n,).
         aim
-            Hedged set points, of the authority, shape (n,).
+            Hedged set points (see `agents.hedge`), in units of the authority, shape (n,).
         held
             Probabilities that the set points do not change before the present flow shows,
             shape (n,).
         forecast
-            Forecasts of the part of the output that the models do not explain, of the
+            Forecasts of the part of the output that the models do not explain, in units of the
             authority, shape (n,).
         noise
-            Standard deviations of one-step errors, plus `DOUBT`, of the authority, shape (n,).
+            Standard deviations of one-step errors, plus `MODEL_ERROR`, in units of the
+            authority, shape (n,).
 
         Returns
         -------
         ndarray of float32
             Shape (n, PAST_INPUTS).
         """
-        bank, estimate = self.bank, self.bank.estimate
-        setpoint = self._setpoint
-        assert setpoint is not None
-        load, gain = self.filter.load, self.filter.gain
+        bank = self._bank
+        load = self.filter.load
+        gain = self.filter.gain
         residuals = bank.outputs - gain * bank.responses
         signals = [
+            # the set point
             setpoint,
             np.abs(setpoint),
             aim - setpoint,
             held,
+            # the output, and what the models do not explain
             output,
             load,
             forecast - load,
-            *_limited(residuals / noise),
-            _limited(bank.innovation / noise),
-            _limited(self.filter.innovation / noise),
+            *_relative_errors(residuals, noise),
+            _relative_errors(bank.innovation, noise),
+            _relative_errors(self.filter.innovation, noise),
+            # the estimates of filters and bank
             *self.filter.weights,
             3.0 * np.log(gain),
             5.0 * self.filter.gain_spread,
-            (estimate.delay - TYPICAL_DELAY) / 10.0,
-            estimate.delay_spread / 4.0,
-            2.0 * (estimate.log_constant - TYPICAL_LOG_CONSTANT),
-            4.0 * estimate.constant_spread,
+            (bank.delay - TYPICAL_DELAY) / 10.0,
+            bank.delay_spread / 4.0,
+            2.0 * (bank.log_constant - TYPICAL_LOG_CONSTANT),
+            4.0 * bank.log_constant_spread,
             0.5 * np.log(noise) + 1.5,
-            2.0 * estimate.fading - 1.0,
+            2.0 * bank.fading - 1.0,
+            # the actuator, and the time since the start of the episode
             self._edge,
             self._centre,
             np.full(bank.n, min(self._k / 600.0, 2.0)),
@@ -204,13 +225,14 @@ class Observer:
         return np.stack(signals, axis=1).astype(np.float32)
 
 
-def _limited(signals: Array) -> Array:
-    """Return half of the signals, after limiting them to +-`OUTLIER`, in the same shape.
+def _relative_errors(errors: Array, noise: Array) -> Array:
+    """Return half of errors / noise, after the ratios are limited to +-`LARGEST_ERROR`.
 
-    `signals` are divided by the standard deviation of the noise.
+    `errors` have the shape (n,) or (lags, n), like the result, and `noise`, the standard
+    deviations of the noise, the shape (n,).
     """
-    limited: Array = 0.5 * np.clip(signals, -OUTLIER, OUTLIER)
-    return limited
+    ratios: Array = 0.5 * np.clip(errors / noise, -LARGEST_ERROR, LARGEST_ERROR)
+    return ratios
 
 
 class Law:
@@ -253,13 +275,9 @@ class Law:
         self._xp = xp
         self._convert = convert
         self._edge = convert(edge)
-        self._low, self._high = map(convert, limits)
-        self._coefficients = tuple(map(convert, second_order(bank.time_constants)))
-        # Outputs of the models with gain 1 and no delay at the present and at the last sample,
-        # shape (time constants, n), and the last flow, shape (n,).
-        self._response = convert(np.zeros_like(bank.time_constants))
-        self._before = self._response
-        self._flow = convert(np.zeros(bank.n, np.float32))
+        self._lowest = convert(limits[0])
+        self._highest = convert(limits[1])
+        self._models = UndelayedModels(bank.time_constants, convert)
 
     def flow(self, situation: Situation, network: Network | None = None) -> Any:
         """Return the flows of a sample, as shares of half the actuator's range, shape (n,).
@@ -275,67 +293,58 @@ class Law:
             The network that corrects the control law. Without a network, the control law is
             linear apart from the dead zone and the limits.
         """
-        convert = self._convert
-        estimate = situation.estimate
+        xp, convert = self._xp, self._convert
         gain = convert(situation.gain)
-        gains = gain * convert(estimate.shares)
-        rate = 1.0 - convert(estimate.pole)
+        gains = gain * convert(situation.shares)  # factors of the models in the mean model
+        model_output = (gains * self._models.outputs).sum(0)
         target = convert(situation.targets)
-        model_output = (gains * self._response).sum(0)
         share: Any = SHARE
         if network is not None:
-            slope = model_output - (gains * self._before).sum(0)
-            outputs = network(self._inputs(situation, model_output, slope))
+            change = model_output - (gains * self._models.last_outputs).sum(0)
+            outputs = network(self._inputs(situation, model_output, change))
             shift = outputs[:, 0]
             stretch = outputs[:, 1]
-            speed = outputs[:, 2]
+            half_logit = outputs[:, 2]
             # Without noise, the shift is 0, so that it leaves no offset.
-            noise = convert(situation.noise - LEAST_NOISE - DOUBT)
+            noise = convert(situation.noise - LEAST_NOISE - MODEL_ERROR)
             spread = convert(situation.gain_spread)
             target = target * (1.0 + spread * stretch) + noise * shift
-            share = 1.0 / (1.0 + self._exp(-2.0 * speed))
+            # The limits keep exp from an overflow.
+            share = 1.0 / (1.0 + xp.exp(xp.clip(-2.0 * half_logit, -20.0, 20.0)))
         # The flow for `target` holds the output there, and the flow for `approach` closes a
         # share of the gap in one sample.
+        rate = 1.0 - convert(situation.pole)
         approach = share / rate * (target - model_output)
-        return self._passing((target + approach) / gain)
+        flow = self._passable((target + approach) / gain)
+        self._models.advance(flow)
+        return flow
 
-    def _inputs(self, situation: Situation, model: Any, slope: Any) -> Any:
+    def _inputs(self, situation: Situation, model_output: Any, change: Any) -> Any:
         """Return all inputs of a network, shape (n, INPUTS), of order 1.
 
-        `model` is the output of the mean model without delay, and `slope` its change since the
-        last sample, both of the authority, shape (n,). `flow` calls this method.
+        `model_output` is the output of the mean model without delay, and `change` its change
+        since the last sample, both in units of the authority, shape (n,).
         """
         xp = self._xp
-        gap = self._convert(situation.targets) - model
-        noise = self._convert(situation.noise)
-        signals = [model, 10.0 * slope, gap, self._flow, gap / (abs(gap) + 2.0 * noise)]
-        past = self._convert(situation.inputs)
-        return xp.concatenate([past, xp.stack(signals, axis=1)], axis=1)
+        gap = self._convert(situation.targets) - model_output
+        relative_gap = gap / (abs(gap) + 2.0 * self._convert(situation.noise))
+        signals = [model_output, 10.0 * change, gap, self._models.last_flow, relative_gap]
+        past_inputs = self._convert(situation.inputs)
+        return xp.concatenate([past_inputs, xp.stack(signals, axis=1)], axis=1)
 
-    def _exp(self, exponents: Any) -> Any:
-        """Return exp of `exponents`, which are limited to +-20 so that exp cannot overflow."""
-        return self._xp.exp(self._xp.clip(exponents, -20.0, 20.0))
+    def _passable(self, wanted: Any) -> Any:
+        """Return wanted flows after they are moved out of the dead zone and limited.
 
-    def _passing(self, wanted: Any) -> Any:
-        """Return wanted flows moved out of the dead zone and limited, and advance the models.
-
-        `wanted` are the flows of the control law, as shares of half the actuator's range, shape
-        (n,). For gradients, the move out of the dead zone is a constant (straight-through
-        estimator).
+        `wanted` and the returned flows are in units of half the actuator's range, shape (n,).
+        In PyTorch, the move out of the dead zone counts as a constant for gradients.
         """
-        xp = self._xp
-        value = wanted.detach() if hasattr(wanted, "detach") else wanted
-        passing = wanted + (avoid_dead_zone(value, self._edge, xp) - value)
-        flow = xp.clip(passing, self._low, self._high)
-        a1, a2, newer, older = self._coefficients
-        response = a1 * self._response + a2 * self._before + newer * flow + older * self._flow
-        self._before = self._response
-        self._response = response
-        self._flow = flow
-        return flow
+        constant = wanted.detach() if self._xp is not np else wanted
+        move = avoid_dead_zone(constant, self._edge, self._xp) - constant
+        return self._xp.clip(wanted + move, self._lowest, self._highest)
 
     def detach(self) -> None:
         """Cut the PyTorch graph, so that later gradients do not reach earlier flows."""
-        self._response = self._response.detach()
-        self._before = self._before.detach()
-        self._flow = self._flow.detach()
+        models = self._models
+        models.outputs = models.outputs.detach()
+        models.last_outputs = models.last_outputs.detach()
+        models.last_flow = models.last_flow.detach()

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.controller import Controller, Index, NotNegative, Values, check, check_numbers
+from agents.controller import Controller, Values, check_numbers, integer_from_0, not_negative
 
 Array = NDArray[np.floating[Any]]
 # The layers of a network, from the inputs on: a pair of weights, shape (outputs, inputs), and
@@ -26,9 +26,10 @@ Layers = Sequence[tuple[Array, Array]]
 # Arguments of the environment that determine the observation, in the order of its elements.
 WINDOWS: Final = ("setpoint_window", "error_window", "output_window", "action_window")
 PRETRAINED: Final = Path(__file__).parent / "pretrained"  # trained networks of this project
-# Largest size of a network file, bytes of all its unpacked arrays: 64 MiB, hundreds of times
-# what a network needs. A larger file could exhaust the memory.
-LARGEST: Final = 2**26
+# Largest size of all unpacked arrays of a network file, bytes: 64 MiB, hundreds of times what a
+# network needs. A larger file could exhaust the memory.
+LARGEST_FILE: Final = 2**26
+FORMAT: Final = 1  # version of the format of network files
 # The activation functions of hidden layers, by name.
 ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
     "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
@@ -41,9 +42,9 @@ ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
 def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.float64]:
     """Return the outputs of a feed-forward network, shape (..., outputs).
 
-    The network is computed in float32, as in its training. A matrix product of a batch adds
-    terms in another order than that of a single row, so the outputs for the same inputs can
-    differ by about 1e-6 between batch sizes.
+    The network is computed in float32, as in its training. The order of additions in a matrix
+    product depends on the batch size, so the outputs for the same inputs can differ by about
+    1e-6 between batch sizes.
 
     Parameters
     ----------
@@ -55,9 +56,10 @@ def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.fl
         Inputs of the network, shape (..., inputs).
     """
     x = np.asarray(inputs, np.float32)
-    *hidden, (last_W, last_b) = layers
-    for W, b in hidden:
-        x = ACTIVATIONS[activation](x @ W.T + b)
+    activate = ACTIVATIONS[activation]
+    *hidden_layers, (last_W, last_b) = layers
+    for W, b in hidden_layers:
+        x = activate(x @ W.T + b)
     return (x @ last_W.T + last_b).astype(np.float64)
 
 
@@ -92,26 +94,29 @@ def check_array(
     return array
 
 
-def check_layers(layers: Layers, inputs: int, outputs: int) -> list[tuple[Array, Array]]:
+def _checked_layers(layers: Layers, inputs: int) -> Layers:
     """Return copies of a network's layers in float32, if their shapes fit.
 
-    `inputs` and `outputs` are the numbers of inputs and outputs that the network must have. A
-    ValueError is raised if there is no layer, if the shape of a layer does not fit the layer
-    before or these numbers, or if a value is not finite.
+    A ValueError is raised if there is no layer, if the network has not `inputs` inputs and one
+    output, if the shapes of two layers do not fit, or if a value is not finite.
     """
     if not layers:
         raise ValueError("layers must hold at least one layer, got none")
     checked = []
     for i, (W, b) in enumerate(layers):
-        nodes = np.size(b) if i < len(layers) - 1 else outputs
+        is_last = i == len(layers) - 1
+        nodes = 1 if is_last else np.size(b)
         weights = check_array(f"weights of layers[{i}]", W, (nodes, inputs))
-        checked.append((weights, check_array(f"biases of layers[{i}]", b, (nodes,))))
-        inputs = nodes
+        biases = check_array(f"biases of layers[{i}]", b, (nodes,))
+        checked.append((weights, biases))
+        inputs = nodes  # of the next layer
     return checked
 
 
 @contextmanager
-def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDArray[Any]]]:
+def open_arrays(
+    path: str | PathLike[str], contents: str
+) -> Iterator[Mapping[str, NDArray[Any]]]:
     """Open an `.npz` file as a mapping of arrays by name, for a `with` statement.
 
     Nothing in the file is executed.
@@ -120,14 +125,14 @@ def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDAr
     ----------
     path
         The file.
-    holds
+    contents
         What the file should hold, in words, for the message of an error.
 
     Raises
     ------
     ValueError
-        If the file is damaged or larger than `LARGEST`, or if the `with` block raises an error
-        because of the file's contents.
+        If the file is damaged or larger than `LARGEST_FILE`, or if the `with` block raises an
+        error, as the contents of the file then are wrong.
     OSError
         If the file cannot be opened.
     """
@@ -135,45 +140,34 @@ def reading(path: str | PathLike[str], holds: str) -> Iterator[Mapping[str, NDAr
         try:
             with np.load(raw, allow_pickle=False) as file:
                 size = sum(member.file_size for member in file.zip.infolist())
-                if size > LARGEST:
-                    raise ValueError(f"its arrays have {size:,} bytes, over {LARGEST:,}")
+                if size > LARGEST_FILE:
+                    raise ValueError(f"its arrays have {size:,} bytes, over {LARGEST_FILE:,}")
                 yield file
         except Exception as error:  # from zip, zlib, NumPy, JSON or a check
-            raise ValueError(f"{path} holds no {holds}, or is damaged: {error}") from error
+            raise ValueError(f"{path} holds no {contents}, or is damaged: {error}") from error
 
 
-def read_layers(file: Mapping[str, Array], layers: int, prefix: str = "") -> Layers:
-    """Return the layers of a network from a file that was written by `write`.
-
-    `file` is what `reading` yields, `layers` the number of layers, and `prefix` the network's
-    key in the argument `layers` of `write`.
-    """
-    return [(file[f"{prefix}W{i}"], file[f"{prefix}b{i}"]) for i in range(layers)]
-
-
-def write(path: str | PathLike[str], layers: Mapping[str, Layers], **arrays: Any) -> None:
-    """Write networks and other arrays to an `.npz` file.
-
-    Parameters
-    ----------
-    path
-        The file.
-    layers
-        The layers of each network. The key is a prefix for the names of the network's arrays:
-        layer i has the arrays `{prefix}W{i}` and `{prefix}b{i}`.
-    **arrays
-        Other arrays, by their names in the file.
-    """
-    for prefix, each in layers.items():
-        for i, (W, b) in enumerate(each):
-            arrays |= {f"{prefix}W{i}": W, f"{prefix}b{i}": b}
+def write_arrays(path: str | PathLike[str], **arrays: Any) -> None:
+    """Write arrays by name to the `.npz` file `path`, which `open_arrays` reads."""
     with Path(path).open("wb") as file:
         np.savez_compressed(file, **arrays)
 
 
+def read_settings(file: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return the settings in a network file: the JSON object in the array `about`.
+
+    `file` is what `open_arrays` yields. A ValueError is raised if the file has another format
+    than `FORMAT`.
+    """
+    settings: dict[str, Any] = json.loads(str(file["about"]))
+    if settings["format"] != FORMAT:
+        raise ValueError(f"its format is {settings['format']!r}, not {FORMAT}")
+    return settings
+
+
 @dataclass(frozen=True)
 class Increments:
-    """Settings of a network in velocity form, whose output changes a *wanted flow*.
+    """Settings of the velocity form, in which a network's output changes a *wanted flow*.
 
     The wanted flow is 0 at the start of an episode. The command follows from the wanted flow by
     a compensation of the actuator's dead zone.
@@ -189,8 +183,8 @@ class Increments:
     zone, the edge of the dead zone is commanded instead of this limit."""
 
     def __post_init__(self) -> None:
-        check("max_move", self.max_move, NotNegative)
-        check("dead_zone", self.dead_zone, NotNegative)
+        not_negative("max_move", self.max_move)
+        not_negative("dead_zone", self.dead_zone)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -200,8 +194,8 @@ class PolicyNetwork(Controller):
     The observation is multiplied by `input_scale` and passed through the layers. An activation
     follows every layer but the last layer, whose single output is clipped to [-1, 1]. The
     clipped output is the action or, with `increments`, changes a wanted flow. The layers are
-    computed in float32, so the actions of a loop in a batch can differ by rounding from those
-    of a single loop; see `forward`.
+    computed in float32, so the action for an observation can differ by rounding between a batch
+    and a single loop; see `forward`.
 
     The arguments `u_min` and `u_max` are those of `Controller`.
 
@@ -236,18 +230,20 @@ class PolicyNetwork(Controller):
             if name not in WINDOWS:
                 raise ValueError(f"observation must name {', '.join(WINDOWS)}, got {name!r}")
         self.observation = {
-            name: check(f"observation[{name!r}]", self.observation.get(name, 0), Index)
+            name: integer_from_0(f"observation[{name!r}]", self.observation.get(name, 0))
             for name in WINDOWS
         }
         self.n_obs = sum(self.observation.values())
-        if self.activation not in [*ACTIVATIONS]:  # a list: it may be unhashable
+        if self.activation not in [*ACTIVATIONS]:  # a list, as `activation` may be unhashable
             raise ValueError(
                 f"activation must be one of {[*ACTIVATIONS]}, got {self.activation!r}"
             )
-        self._edge = self.increments.dead_zone if self.increments else 0.0
         self.input_scale = check_array("input_scale", self.input_scale, (self.n_obs,))
-        self.layers = check_layers(self.layers, self.n_obs, 1)
-        self._remembers = self.increments is not None
+        self.layers = _checked_layers(self.layers, self.n_obs)
+        if self.increments is None:
+            self._remembers = False
+        else:
+            self._edge = self.increments.dead_zone
 
     @classmethod
     def load(
@@ -269,33 +265,40 @@ class PolicyNetwork(Controller):
         OSError
             If the file cannot be opened.
         """
-        with reading(path, "policy network") as file:
-            about = json.loads(str(file["about"]))
-            if about["format"] != 1:
-                raise ValueError(f"its format is {about['format']!r}, not 1")
-            increments = about["increments"]
+        with open_arrays(path, "policy network") as file:
+            settings = read_settings(file)
+            increments = settings["increments"]
+            if increments is not None:
+                increments = Increments(**increments)
             network = cls(
-                read_layers(file, about["layers"]),
-                observation=about["observation"],
+                [(file[f"W{i}"], file[f"b{i}"]) for i in range(settings["layers"])],
+                observation=settings["observation"],
                 input_scale=file["input_scale"],
-                activation=about["activation"],
-                increments=None if increments is None else Increments(**increments),
-                provenance=about["provenance"],
+                activation=settings["activation"],
+                increments=increments,
+                provenance=settings["provenance"],
             )
         # Outside the `with` block: invalid limits do not mean that the file is damaged.
         return replace(network, u_min=u_min, u_max=u_max)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the network, without the limits of the flow, to the `.npz` file `path`."""
-        about = {
-            "format": 1,
+        increments = None
+        if self.increments is not None:
+            increments = asdict(self.increments)
+        settings = {
+            "format": FORMAT,
             "layers": len(self.layers),
             "observation": self.observation,
             "activation": self.activation,
-            "increments": None if self.increments is None else asdict(self.increments),
+            "increments": increments,
             "provenance": self.provenance,
         }
-        write(path, {"": self.layers}, about=json.dumps(about), input_scale=self.input_scale)
+        arrays = {}
+        for i, (W, b) in enumerate(self.layers):
+            arrays[f"W{i}"] = W
+            arrays[f"b{i}"] = b
+        write_arrays(path, about=json.dumps(settings), input_scale=self.input_scale, **arrays)
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
         """Refuse plants that the network was not made for, by a ValueError.
@@ -304,10 +307,11 @@ class PolicyNetwork(Controller):
         `Controller`, the plants must have the observation that the network expects.
         """
         super().check_environment(parameters, wrapped, n)
-        given = {name: getattr(parameters, name) for name in WINDOWS}
-        if given != self.observation:
+        wanted = self.observation
+        windows = {name: getattr(parameters, name) for name in WINDOWS}
+        if windows != wanted:
             raise ValueError(
-                f"env must have the windows that policy wants, {self.observation}, got {given}"
+                f"env must have the windows that policy wants, {wanted}, got {windows}"
             )
 
     def reset(self) -> None:
@@ -327,14 +331,29 @@ class PolicyNetwork(Controller):
             )
         outputs = forward(self.layers, self.activation, rows * self.input_scale)
         output = np.clip(outputs[:, 0], -1.0, 1.0)
-        half_range, z = (self.u_max - self.u_min) / 2.0, self._edge
+        half_range = (self.u_max - self.u_min) / 2.0
         if self.increments is None:
             return self.u_min + (output + 1.0) * half_range
-        moved, lowest = self._flow + self.increments.max_move * output, self.u_min / half_range
-        self._flow = flow = np.clip(moved, lowest, self.u_max / half_range)
-        if z == 0.0:
+        wanted = self._flow + self.increments.max_move * output
+        lowest = self.u_min / half_range
+        flow = np.clip(wanted, lowest, self.u_max / half_range)
+        self._flow = flow
+        if self.increments.dead_zone == 0.0:
             return self.u_min + (flow - lowest) * half_range
+        return self._compensated(flow, self.increments.dead_zone)
+
+    def _compensated(self, flow: Array, edge: float) -> NDArray[np.float64]:
+        """Return the commands, t/h, shape (loops,), that compensate the dead zone.
+
+        The rule is that of `Increments.dead_zone`. `flow` are the wanted flows, as shares of
+        half the actuator's range, shape (loops,), and `edge` is the half width of the dead
+        zone, t/h.
+        """
+        half_range = (self.u_max - self.u_min) / 2.0
+        # The limit in the direction of the flow, t/h; any number other than 0 for a flow of 0.
         limit = np.where(flow > 0.0, self.u_max, np.where(flow < 0.0, -self.u_min, 1.0))
         share = np.abs(flow) * (half_range / limit)
-        command: NDArray[np.float64] = np.sign(flow) * (z + share * np.maximum(limit - z, 0.0))
+        command: NDArray[np.float64] = np.sign(flow) * (
+            edge + share * np.maximum(limit - edge, 0.0)
+        )
         return command

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.bank import CAUTION, FAST_POLE, GAINS, NOISE_COLOUR
+from agents.bank import FAST_POLE, GAIN_LIMITS, LIKELIHOOD_FACTOR, NOISE_COLOUR
 
 Array = NDArray[np.floating[Any]]
 
@@ -22,18 +22,20 @@ Array = NDArray[np.floating[Any]]
 LOAD_CHANGES: Final = np.array([0.001, 0.007, 0.03, 0.03])
 NOISE_SHARES: Final = np.array([1.0, 1.0, 1.0, 0.25])
 LOAD_MEMORY: Final = 0.998  # share of the load that is expected to remain after a sample
-# Standard deviation of the change of the gain per sample, as a share of the step test's gain,
-# for a gain whose standard deviation before the first sample is `REFERENCE_SPREAD`.
-GAIN_CHANGE: Final = 0.004
-REFERENCE_SPREAD: Final = 0.25
-FILTER_MEMORY: Final = 0.998  # forgetting factor of the filters' log-likelihoods, per sample
+# Standard deviation of the change of the gain per sample, divided by the standard deviation of
+# the gain before the first sample.
+GAIN_CHANGE: Final = 0.016
+# Forgetting factor of the filters' log-likelihoods, per sample.
+FILTER_FORGETTING: Final = 0.998
 READING_SHARE: Final = 0.1  # share of the noise variance that is noise of the transmitter
 
-RESIDUAL, OLDER, LOAD, GAIN = range(4)  # places of the elements in the state of a filter
+# Indices in the state of a filter: the residual v(k), the part of v(k+1) that is carried over
+# from the last sample, the load w(k) and the gain g(k). See `OutputFilter`.
+RESIDUAL, CARRIED, LOAD, GAIN = range(4)
 
 
 class OutputFilter:
-    """Kalman filters of the outputs of n plants; they differ in their assumptions on the load.
+    """Kalman filters of the outputs of n plants, with different assumptions on load and noise.
 
     The output is y(k) = g(k) s(k) + v(k), where g is the plant's gain, and s the output of the
     bank's mean model with gain 1 for the past flows. The residual v is the sum of noise and of
@@ -44,10 +46,10 @@ class OutputFilter:
 
     The noises xi and eta are white. The coefficients a1 and a2 follow from the poles of the
     mean model, and c is the coefficient of z^-1 in the polynomial C of equation (28) of the
-    paper. The gain g changes by a random walk. The state of a filter is v(k), a2 v(k-1) +
-    c xi(k), w(k) and g(k). The filters differ in the standard deviation of eta and in the
-    variance of xi. A filter is weighted by the likelihood of its one-step errors, in which old
-    errors are forgotten exponentially.
+    paper. The gain g changes by a random walk. The state of a filter has four elements: v(k),
+    a2 v(k-1) + c xi(k), w(k) and g(k). The filters differ in the standard deviation of eta and
+    in the variance of xi. The weight of a filter is the likelihood of its one-step errors,
+    which forgets old errors exponentially.
 
     Parameters
     ----------
@@ -61,10 +63,10 @@ class OutputFilter:
         Mean and standard deviation of the gain, as multiples of the step test's gain, shape
         (n,).
     load : ndarray
-        Mean of the load w, of the authority, shape (n,).
+        Mean of the load w, in units of the authority, shape (n,).
     innovation : ndarray
-        Newest one-step error of the output, mean over the filters, of the authority, shape
-        (n,).
+        Newest one-step error of the output, mean over the filters, in units of the authority,
+        shape (n,).
     weights : ndarray
         Probabilities of the filters, shape (filters, n).
     """
@@ -73,16 +75,15 @@ class OutputFilter:
         spread = np.asarray(gain_spread, np.float64)
         n = len(spread)
         filters = len(LOAD_CHANGES)
+        # At the start, load and residual are known to be 0, and the gain is that of the step
+        # test with an uncertainty.
         self._states = np.zeros((filters, n, 4))
         self._states[:, :, GAIN] = 1.0
         self._covariances = np.zeros((filters, n, 4, 4))
         self._covariances[:, :, GAIN, GAIN] = np.square(spread)
-        self._gain_changes = np.square(GAIN_CHANGE * spread / REFERENCE_SPREAD)
+        self._gain_changes = np.square(GAIN_CHANGE * spread)
         self._log_likelihoods = np.zeros((filters, n))
         self._response = np.zeros(n)
-        self.weights = np.full((filters, n), 1.0 / filters)
-        self.innovation = np.zeros(n)
-        self._summarise()
 
     def update(self, output: Array, responses: Array, poles: Array, variances: Array) -> None:
         """Update all filters with the outputs of a sample; call this method once per sample.
@@ -90,79 +91,91 @@ class OutputFilter:
         Parameters
         ----------
         output
-            Measured outputs y(k), of the authority, shape (n,).
+            Measured outputs y(k), in units of the authority (see `agents.bank`), shape (n,).
         responses
             Outputs s(k) and s(k-1) of the bank's present mean models with gain 1, shape (2, n).
         poles
             Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
             (n,).
         variances
-            Variances of the bank's one-step errors, of the authority squared, shape (n,).
+            Variances of the bank's one-step errors, in units of the authority squared, shape
+            (n,).
         """
-        response, previous = responses
-        self._follow(previous - self._response, poles)
+        # Responses of the past change if the bank has changed the mean model.
+        response, last_response = responses
+        self._attribute_to_load(last_response - self._response, poles)
         self._response = response
+        # Predict the states of this sample from the states of the last sample.
         noises = NOISE_SHARES[:, np.newaxis] * variances
         transition, disturbances = self._matrices(poles, noises)
         states = np.einsum("nij,fnj->fni", transition, self._states)
         covariances = transition @ self._covariances @ transition.transpose(0, 2, 1)
         covariances = covariances + disturbances
-        # The output is the residual and the gain times the response.
+        # Predict the output: the sum of the residual and of gain times response. The cross
+        # covariances are the covariances between the states and the output.
         of_gain = response[:, np.newaxis] * covariances[:, :, :, GAIN]
-        effects = covariances[:, :, :, RESIDUAL] + of_gain
-        error_variances = effects[:, :, RESIDUAL] + response * effects[:, :, GAIN]
+        cross_covariances = covariances[:, :, :, RESIDUAL] + of_gain
+        error_variances = (
+            cross_covariances[:, :, RESIDUAL] + response * cross_covariances[:, :, GAIN]
+        )
         error_variances = error_variances + READING_SHARE * noises
         errors = output - states[:, :, RESIDUAL] - response * states[:, :, GAIN]
-        corrections = effects / error_variances[:, :, np.newaxis]
+        # Correct the states by the errors of the predicted outputs.
+        corrections = cross_covariances / error_variances[:, :, np.newaxis]
         self._states = states + corrections * errors[:, :, np.newaxis]
-        self._covariances = covariances - (
-            corrections[:, :, :, np.newaxis] * effects[:, :, np.newaxis, :]
-        )
-        self._weigh(errors, error_variances)
-        self._summarise()
+        products = corrections[:, :, :, np.newaxis] * cross_covariances[:, :, np.newaxis, :]
+        self._covariances = covariances - products
+        self._average(errors, error_variances)
 
     def forecast(self, poles: Array, fading: Array) -> Array:
-        """Return forecasts of the residuals v at the time when the present flows show, (n,).
+        """Return forecasts of the residuals v for the time when the present flows show.
 
-        The residual v is the part of the output, of the authority, that the bank's mean model
-        does not explain. In d + 1 samples, for the delay d, the fast part of v decays to 0, and
-        the slow part of v moves from its present value to the load. The load is expected not to
-        change.
+        The residual v is the part of the output that the bank's mean model does not explain. In
+        d + 1 samples, for the delay d, the fast part of v decays to 0, and the slow part of v
+        moves from its present value to the load. The load is expected not to change. The
+        forecasts are in units of the authority (see `agents.bank`), shape (n,).
 
         Parameters
         ----------
         poles
-            Slow poles of the mean models, shape (n,).
+            Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
+            (n,).
         fading
-            Share of the distance between slow part and load that remains, shape (n,).
+            Share of the distance between the slow part and the load that remains after d + 1
+            samples, shape (n,).
         """
-        slow = (poles * self._mean[RESIDUAL] + self._mean[OLDER]) / (poles - FAST_POLE)
+        residual = self._mean_state[RESIDUAL]
+        carried = self._mean_state[CARRIED]
+        # The slow part of v, from the partial fractions of the two poles, and its value after a
+        # long time with the present load.
+        slow = (poles * residual + carried) / (poles - FAST_POLE)
         slow_of_load = self.load * poles * (1.0 - FAST_POLE) / (poles - FAST_POLE)
         forecasts: Array = self.load + fading * (slow - slow_of_load)
         return forecasts
 
-    def _follow(self, changes: Array, poles: Array) -> None:
-        """Move part of the output from the model to the load, after a change of the mean model.
+    def _attribute_to_load(self, changes: Array, poles: Array) -> None:
+        """Attribute a change of the mean model's past output to a load, in all states.
 
         The probabilities of the bank's models change with time, and then the mean model
-        explains more or less of the same past output. The difference is attributed to a load
-        that has been constant for long. `changes` are the changes of s(k-1), shape (n,), and
-        `poles` the slow poles of the mean models, shape (n,).
+        explains more or less of a past output. The states change as if a constant load
+        explained the difference. `changes` are the changes of s(k-1) in units of the authority,
+        and `poles` the slow poles of the mean models, both of shape (n,).
         """
         residuals = -self._states[:, :, GAIN] * changes
         self._states[:, :, RESIDUAL] += residuals
-        self._states[:, :, OLDER] -= poles * FAST_POLE * residuals
+        self._states[:, :, CARRIED] -= poles * FAST_POLE * residuals
         self._states[:, :, LOAD] += residuals
 
     def _matrices(self, poles: Array, noises: Array) -> tuple[Array, Array]:
-        """Return the matrices of the filters' state equations for a sample.
+        """Return the transition matrices and noise covariances of the state equations.
 
         Parameters
         ----------
         poles
-            Slow poles of the mean models, shape (n,).
+            Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
+            (n,).
         noises
-            Noise variances that the filters assume, of the authority squared, shape
+            Noise variances that the filters assume, in units of the authority squared, shape
             (filters, n).
 
         Returns
@@ -177,9 +190,9 @@ class OutputFilter:
         a2 = -poles * FAST_POLE
         transition = np.zeros((n, 4, 4))
         transition[:, RESIDUAL, RESIDUAL] = a1
-        transition[:, RESIDUAL, OLDER] = 1.0
+        transition[:, RESIDUAL, CARRIED] = 1.0
         transition[:, RESIDUAL, LOAD] = (1.0 - a1 - a2) * LOAD_MEMORY
-        transition[:, OLDER, RESIDUAL] = a2
+        transition[:, CARRIED, RESIDUAL] = a2
         transition[:, LOAD, LOAD] = LOAD_MEMORY
         transition[:, GAIN, GAIN] = 1.0
         from_xi = np.array([1.0, NOISE_COLOUR[0], 0.0, 0.0])
@@ -193,23 +206,20 @@ class OutputFilter:
         covariances[:, :, GAIN, GAIN] += self._gain_changes
         return transition, covariances
 
-    def _weigh(self, errors: Array, variances: Array) -> None:
-        """Update the probabilities of the filters, `weights`, and `innovation`.
+    def _average(self, errors: Array, variances: Array) -> None:
+        """Update the probabilities of the filters, and the means over the filters.
 
-        `errors` are the filters' one-step errors at this sample, of the authority, and
+        `errors` are the filters' one-step errors at this sample, in units of the authority, and
         `variances` the variances that the filters expected, both of shape (filters, n).
         """
-        self._log_likelihoods *= FILTER_MEMORY
         losses = np.square(errors) / variances + np.log(variances)
-        self._log_likelihoods -= 0.5 * CAUTION * losses
+        self._log_likelihoods *= FILTER_FORGETTING
+        self._log_likelihoods -= 0.5 * LIKELIHOOD_FACTOR * losses
         weights = np.exp(self._log_likelihoods - self._log_likelihoods.max(0))
         self.weights = weights / weights.sum(0)
         self.innovation = (self.weights * errors).sum(0)
-
-    def _summarise(self) -> None:
-        """Compute `load`, `gain` and `gain_spread`, the means over the filters."""
-        self._mean = np.einsum("fn,fni->in", self.weights, self._states)
-        self.load = self._mean[LOAD]
-        self.gain = np.clip(self._mean[GAIN], *GAINS)
+        self._mean_state = np.einsum("fn,fni->in", self.weights, self._states)
+        self.load = self._mean_state[LOAD]
+        self.gain = np.clip(self._mean_state[GAIN], *GAIN_LIMITS)
         variance = (self.weights * self._covariances[:, :, GAIN, GAIN]).sum(0)
         self.gain_spread = np.sqrt(np.maximum(variance, 0.0))

@@ -1,4 +1,4 @@
-"""Implement PI controllers: that of Section 5 of the paper, and controllers tuned by a rule."""
+"""Implement the PI controller of Section 5 of the paper, and PI controllers tuned by a rule."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from agents.controller import (
     Controller,
     Flag,
-    Gain,
     Index,
-    NotNegative,
     Number,
-    Positive,
     Values,
-    check,
+    nonzero,
+    not_negative,
+    positive,
 )
 
 Array = NDArray[np.float64]
@@ -74,7 +73,7 @@ class PIController(Controller):
     ) -> PIController:
         """Return a controller tuned by the SIMC rule, with anti-windup.
 
-        The SIMC rule for PI controllers is that of S. Skogestad, "Simple analytic rules for
+        The SIMC rule for PI controllers was published by Skogestad, "Simple analytic rules for
         model reduction and PID controller tuning", Journal of Process Control 13, 2003,
         291-309, equations (23) and (24).
 
@@ -87,8 +86,8 @@ class PIController(Controller):
         delay
             theta, the plant's delay, s.
         closed_loop_time_constant
-            tau_c, the wanted time constant of the closed loop, s. The default is the delay,
-            which Skogestad recommends for "tight control with good robustness".
+            tau_c, the wanted time constant of the closed loop, s. Without this argument, tau_c
+            is the delay, as Skogestad recommends for "tight control with good robustness".
         sampling_interval
             Sampling interval, s.
         **arguments
@@ -100,19 +99,21 @@ class PIController(Controller):
             If an argument is out of range, or if the delay is 0 and no
             `closed_loop_time_constant` is given.
         """
-        k = check("gain", gain, Gain)
-        tau_1 = check("time_constant", time_constant, Positive)
-        theta = check("delay", delay, NotNegative)
-        if closed_loop_time_constant is None and theta == 0.0:
-            raise ValueError("closed_loop_time_constant must be given where delay is 0")
+        k = nonzero("gain", gain)
+        tau_1 = positive("time_constant", time_constant)
+        theta = not_negative("delay", delay)
         if closed_loop_time_constant is None:
+            if theta == 0.0:
+                raise ValueError("closed_loop_time_constant must be given where delay is 0")
             closed_loop_time_constant = theta
-        tau_c = check("closed_loop_time_constant", closed_loop_time_constant, Positive)
-        interval = check("sampling_interval", sampling_interval, Positive)
+        tau_c = positive("closed_loop_time_constant", closed_loop_time_constant)
+        interval = positive("sampling_interval", sampling_interval)
         # Equation (23) of Skogestad, with the sign of u = -Kp e, and equation (24).
         kp = -tau_1 / (k * (tau_c + theta))
         tau_i = min(tau_1, 4 * (tau_c + theta))
-        return cls(kp, kp * interval / tau_i, **{"anti_windup": True, **arguments})
+        ki = kp * interval / tau_i
+        arguments.setdefault("anti_windup", True)
+        return cls(kp, ki, **arguments)
 
     def reset(self) -> None:
         """Set the sum of the errors to zero, before a new episode."""

@@ -6,19 +6,24 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.law import INPUTS, OUTPUTS
-from agents.networks import PRETRAINED, check_array, reading
+from agents.networks import (
+    FORMAT,
+    PRETRAINED,
+    check_array,
+    open_arrays,
+    read_settings,
+    write_arrays,
+)
 
 Array = NDArray[np.floating[Any]]
 
 DEFAULT_FILE: Final = PRETRAINED / "neural-10000.npz"  # the network of training seed 10,000
-FORMAT: Final = 1  # version of the file format, which `load` checks
 
 
 @dataclass(frozen=True)
@@ -28,8 +33,8 @@ class RecurrentNetwork:
     The network corrects the control law of `agents.law`. Each layer after the recurrent unit
     also receives the network's inputs. Weights and biases are defined as those of
     `torch.nn.GRUCell` and `torch.nn.Linear`, in float32. The rows of the recurrent unit's
-    arrays belong to its reset gate, then its update gate, then its candidate state. The number
-    of nodes in the recurrent unit is `nodes`, and that in the hidden layer is `hidden`.
+    arrays belong to the reset gate, then the update gate, then the candidate state. The
+    recurrent unit has `nodes` nodes, and the hidden layer has `hidden` nodes.
     """
 
     input_weights: Array
@@ -53,7 +58,9 @@ class RecurrentNetwork:
     """How the network was trained, for the network's file; JSON-serialisable."""
 
     def __post_init__(self) -> None:
-        nodes, hidden = np.shape(self.state_weights)[-1], np.size(self.hidden_biases)
+        """Replace the arrays by float32 copies; raise a ValueError if a shape does not fit."""
+        nodes = np.shape(self.state_weights)[-1]
+        hidden = np.size(self.hidden_biases)
         shapes = {
             "input_weights": (3 * nodes, INPUTS),
             "input_biases": (3 * nodes,),
@@ -65,7 +72,8 @@ class RecurrentNetwork:
             "output_biases": (OUTPUTS,),
         }
         for name, shape in shapes.items():
-            object.__setattr__(self, name, check_array(name, getattr(self, name), shape))
+            array = check_array(name, getattr(self, name), shape)
+            object.__setattr__(self, name, array)  # as the dataclass is frozen
 
     @property
     def weights(self) -> dict[str, Array]:
@@ -107,23 +115,19 @@ class RecurrentNetwork:
 
         A ValueError is raised if the file is damaged or holds something else.
         """
-        with reading(path, "recurrent network") as file:
-            about = json.loads(str(file["about"]))
-            if about["format"] != FORMAT:
-                raise ValueError(f"its format is {about['format']!r}, not {FORMAT}")
+        with open_arrays(path, "recurrent network") as file:
+            settings = read_settings(file)
             names = [name for name in cls.__annotations__ if name != "provenance"]
             weights = {name: file[name] for name in names}
-            return cls(**weights, provenance=about["provenance"])
+            return cls(**weights, provenance=settings["provenance"])
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the network to the `.npz` file `path`, which `load` reads."""
-        about = json.dumps({"format": FORMAT, "provenance": dict(self.provenance)})
-        arrays: dict[str, Any] = {**self.weights, "about": about}
-        with Path(path).open("wb") as file:
-            np.savez_compressed(file, **arrays)
+        settings = {"format": FORMAT, "provenance": dict(self.provenance)}
+        write_arrays(path, **self.weights, about=json.dumps(settings))
 
 
 def _sigmoid(values: Array) -> Array:
     """Return 1 / (1 + exp(-x)) for `values` x, in the same shape, without an overflow."""
-    half: Array = 0.5 + 0.5 * np.tanh(0.5 * values)
-    return half
+    activations: Array = 0.5 + 0.5 * np.tanh(0.5 * values)
+    return activations

@@ -22,18 +22,18 @@ class SmithPredictor(InternalModelController):
     A first-order model with a delay runs in parallel with the plant. The model's undelayed
     output minus the model's delayed output is the effect of flows that have not yet shown in
     the plant's output. The PI controller acts on the error minus the effect of these flows. If
-    the model is right, the PI controller acts as if the plant had no delay (O. J. M. Smith,
-    "Closer control of loops with dead time", Chemical Engineering Progress 53, 1957, 217-219).
+    the model is right, the PI controller acts as if the plant had no delay (Smith, "Closer
+    control of loops with dead time", Chemical Engineering Progress 53, 1957, 217-219).
 
     The gains `kp` and `ki` follow from the SIMC rule for the plant without delay (see
     `PIController.simc`). The input of the model is the flow that the actuator passes. A command
     inside the dead zone is moved to 0 or to the edge of the dead zone, whichever is nearer.
 
     To prevent windup, the integral part of the command follows the wanted flow, limited to the
-    actuator's range, with the time constant of the integral action (K. J. Astrom and T.
-    Hagglund, "PID Controllers", 2nd edition, 1995, section 3.5). As long as no limit of the
-    flow is active, the controller with anti-windup equals an ordinary PI controller. While the
-    wanted flow is inside the dead zone, the controller goes on integrating.
+    actuator's range, with the time constant of the integral action (Astrom and Hagglund, "PID
+    Controllers", 2nd edition, 1995, section 3.5). As long as no limit of the flow is active,
+    the controller with anti-windup equals an ordinary PI controller. While the wanted flow is
+    inside the dead zone, the controller goes on integrating.
 
     The other parameters are those of `ModelBasedController`.
 
@@ -77,8 +77,8 @@ class SmithPredictor(InternalModelController):
         """Return the transfer function from the error e to the command u, t/h per degC.
 
         The Smith predictor is linear while the command is between the limits of the flow and
-        outside the dead zone. Its transfer function is that of the PI controller with a
-        feedback: the undelayed model minus the delayed model.
+        outside the dead zone. The predictor is the PI controller with a feedback from u: the
+        undelayed model minus the delayed model.
 
         Returns
         -------
@@ -101,10 +101,9 @@ class SmithPredictor(InternalModelController):
         """
         in_transit = self._undelayed - self._delayed
         error = rows[:, self.error_index] - in_transit
-        gain = self.kp + self.ki  # the sum includes the present error
+        gain = self.kp + self.ki  # of the present error, which the sum of errors includes
         wanted = self._integral - gain * error
-        within = np.clip(wanted, self.u_min, self.u_max)
-        self._integral = self._integral + self.ki / gain * (within - self._integral)
-        command = self._passable(wanted)
-        self._advance(command)
-        return command
+        # Anti-windup: the integral follows the limited flow, and not the wanted flow.
+        limited = np.clip(wanted, self.u_min, self.u_max)
+        self._integral = self._integral + self.ki / gain * (limited - self._integral)
+        return self._command(wanted)

@@ -12,7 +12,7 @@ from agents import (
     SelfTuningController,
     output_filter,
 )
-from agents.bank import FAST_POLE, LAGS, NOISE_COLOUR, Bank, Prior, second_order
+from agents.bank import FAST_POLE, LAGS, NOISE_COLOUR, Bank, Prior, model_coefficients
 from agents.hedge import RandomSetpoint
 from agents.law import Law, Observer
 from agents.output_filter import LOAD_MEMORY, READING_SHARE, OutputFilter
@@ -64,7 +64,7 @@ def single_model(gain_spread):
 
 def simulated(flows):
     """Return the outputs of a model of gain 1 by its difference equation."""
-    a1, a2, newer, older = second_order(np.array(CONSTANT))
+    a1, a2, newer, older = model_coefficients(np.array(CONSTANT))
     outputs = np.zeros(len(flows))
     for k in range(1, len(flows)):
         newest, before = (flows[i] if i >= 0 else 0.0 for i in (k - DELAY - 1, k - DELAY - 2))
@@ -122,7 +122,7 @@ class TestOutputFilter:
 
     def test_gain_and_load_are_those_of_all_samples_at_once(self, rng, monkeypatch):
         # The unknowns and the outputs are jointly normal: condition them in one step.
-        change, drift = 0.02, output_filter.GAIN_CHANGE * self.SPREAD / 0.25
+        change, drift = 0.02, output_filter.GAIN_CHANGE * self.SPREAD
         monkeypatch.setattr(output_filter, "LOAD_CHANGES", np.array([change]))
         monkeypatch.setattr(output_filter, "NOISE_SHARES", np.array([1.0]))
         samples = self.SAMPLES
