@@ -336,6 +336,13 @@ class TestPredictiveController:
         least = minimum_variance(Parameters(noise_variance=0.5, **plant))
         assert runs.output[100:].var() == pytest.approx(least, rel=0.03)
 
+    def test_zeros_in_b_are_a_delay(self):
+        b, case = Parameters().b, {"samples": 400, "setpoint": 5.0}
+        delayed = mean_error(run_mpc(1, **case))
+        zeros_in_front = mean_error(run_mpc(1, b=(0.0, 0.0, *b), delay=16, **case))
+        np.testing.assert_allclose(zeros_in_front, delayed, rtol=0.01)
+        assert mean_error(run_mpc(1, b=(0.0,), **case)) == 5.0  # No flow has an effect.
+
     @pytest.mark.parametrize(
         ("plant", "setpoint"),
         [

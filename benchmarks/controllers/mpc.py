@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 HORIZON = 5  # flows in a plan, one a sample; the first flow is applied, then all are replanned
 SWEEPS = 100  # limit of the sweeps of coordinate descent, to bound the time of a sample
 TOLERANCE = 1e-4  # t/h; coordinate descent stops if a sweep changes no flow by this much
-TINY = 1e-9  # added to variances, degC^2, and to divisors, so that none of them is 0
+TINY = 1e-9  # added to variances, degC^2, so that none of them is 0
+SMALLEST = np.finfo(np.float64).tiny  # least divisor, in place of 0
 WARM_UP = 200  # samples until the covariance of the Kalman filter hardly changes
 
 
@@ -348,7 +349,8 @@ class PredictiveController:
             for i in free:
                 # The derivative of the cost by this flow becomes 0 at the best flow.
                 descent = slopes[i] - np.add.reduce(plan * model.rows[i])
-                best = plan[i] + descent / model.rows[i, i]
+                # If the flow affects no output within the horizon, both numbers are 0.
+                best = plan[i] + descent / np.maximum(model.rows[i, i], SMALLEST)
                 np.maximum(best, self._numbers.u_min, out=best)
                 np.minimum(best, self._numbers.u_max, out=plan[i])
             if np.abs(plan - before).max() < TOLERANCE:
