@@ -15,7 +15,8 @@ from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.least import least_possible, with_hidden_load
 from benchmarks.bounds.linear_program import equations, plan, reference, response
-from benchmarks.bounds.unknown import load_changes, noise_variance, unknown
+from benchmarks.bounds.prediction import noise_variance
+from benchmarks.bounds.unknown import load_changes, unknown
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
@@ -354,7 +355,7 @@ class TestPredictiveController:
         controller = PredictiveController(Parameters(**plant), 1)
         believed = []
         plants = make_plants(1, 300, setpoint=setpoint, **plant)
-        watch = lambda k: believed.append(controller._inputs[0, 1])  # noqa: E731
+        watch = lambda k: believed.append(controller._flows[0, 1])  # noqa: E731
         runs = rollout(plants, controller, 300, seed=0, before=watch)
         np.testing.assert_allclose(believed[1:], runs.applied[:-1, 0], rtol=0, atol=1e-5)
         assert len(np.unique(runs.applied[150:].round(3))) == 2  # it switches ...

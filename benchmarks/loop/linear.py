@@ -27,6 +27,9 @@ from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
 
 Array = NDArray[np.float64]
 
+# Places of the two parts of the load in a state vector: the piecewise constant part, which
+# changes in steps, and the random walk.
+LOAD_STEPS, LOAD_WALK = -2, -1
 # Smith's method reads the times at which a step response reaches these shares of its final
 # value. A lag with the time constant T reaches them after T / 3 and T.
 EARLY_LEVEL, LATE_LEVEL = 0.283, 0.632
@@ -133,11 +136,16 @@ class LinearModel:
                 response[..., k] += self.alpha[..., i] * response[..., k - 1 - i]
         return response
 
+    @property
+    def outputs_in_state(self) -> int:
+        """Number of outputs y(k), y(k-1), ... at the start of the state of `state_space`."""
+        return max(len(self.parameters.a) - 1, 1)
+
     def state_space(self) -> tuple[Array, Array]:
         """Return the matrices F and g of the state equation x(k) = F x(k-1) + g xi(k).
 
         The state x(k) consists of the latest outputs y(k), y(k-1), ... and the latest values
-        xi(k), xi(k-1), ... of the white noise; flows and load are left out.
+        xi(k), xi(k-1), ... of the white noise. The effects of flows and load are left out.
 
         Returns
         -------
@@ -147,13 +155,53 @@ class LinearModel:
             The effect of the noise, elements 0 and 1, shape (size,).
         """
         c = self.parameters.c
-        order = max(self.alpha.shape[-1], 1)
+        order = self.outputs_in_state
         size = order + len(c) - 1
         F = np.zeros((*self.load.shape, size, size)) + np.eye(size, k=-1)
         F[..., order : order + 1, :] = 0.0  # xi(k) is new
         F[..., 0, : self.alpha.shape[-1]] = self.alpha
         F[..., 0, order:] = c[1:]
-        return F, np.isin(np.arange(size), (0, order)).astype(float)
+        g = np.zeros(size)
+        g[0] = 1.0
+        g[order : order + 1] = 1.0  # empty if C = 1: the state then has no noise
+        return F, g
+
+    def state_space_with_load(self, stays: Array) -> tuple[Array, Array]:
+        """Return the matrices F and E of the state equation x(k) = F x(k-1) + E v(k).
+
+        The state x(k) is the state of `state_space`, followed by the two parts of the load,
+        degC: the piecewise constant part at the place `LOAD_STEPS`, and the random walk at the
+        place `LOAD_WALK`. The effects of flows are left out. The vector v(k) has three
+        elements: the noise xi(k), the random change of the piecewise constant part, and the
+        step of the random walk.
+
+        Parameters
+        ----------
+        stays
+            The mean of the piecewise constant part at sample k as a share of its value at
+            sample k - 1, shape (...).
+
+        Returns
+        -------
+        F : Array
+            The state transition matrix, shape (..., size, size).
+        E : Array
+            The effects of v(k) on the state, shape (..., size, 3).
+        """
+        F_noise, g = self.state_space()
+        size = len(g) + 2
+        F = np.zeros((*self.load.shape, size, size))
+        F[..., :LOAD_STEPS, :LOAD_STEPS] = F_noise
+        F[..., LOAD_STEPS, LOAD_STEPS] = stays
+        F[..., LOAD_WALK, LOAD_WALK] = 1.0
+        F[..., 0, LOAD_STEPS] = self.load * stays
+        F[..., 0, LOAD_WALK] = self.load
+        E = np.zeros((*self.load.shape, size, 3))
+        E[..., :LOAD_STEPS, 0] = g
+        E[..., 0, 1:] = self.load[..., np.newaxis]
+        E[..., LOAD_STEPS, 1] = 1.0
+        E[..., LOAD_WALK, 2] = 1.0
+        return F, E
 
 
 def nominal(parameters: Parameters) -> LinearModel:
