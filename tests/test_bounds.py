@@ -289,7 +289,7 @@ class TestLeastPossible:
             "samples must be an integer": {"samples": 0},
             "episodes must be an integer": {"episodes": 0},
             "kind must be one of": {"kind": "best"},
-            "set point 'square' has no law, got 'causal'": {"kind": "causal"},
+            "set point 'square' is not random, got 'causal'": {"kind": "causal"},
             "delay must be": {"delay": -1},
             "must be held until": {"kind": "reference", "setpoint_period": 100},
         }.items():

@@ -90,8 +90,7 @@ class SetPointLaw:
         # output approaches the farthest temperature that the limits allow. `_progress` is the
         # share of this way that the output has made, by the age of the level.
         age = np.arange(samples)
-        slowest_pole = np.abs(np.roots([1.0, *-at_start.alpha])).max(initial=0.0)
-        self._progress = 1.0 - slowest_pole ** np.maximum(age - model.lag + 1, 0)
+        self._progress = 1.0 - at_start.slowest_pole ** np.maximum(age - model.lag + 1, 0)
         # From this age on, the output has arrived at the new level after any change. The
         # largest change within reach is from -amplitude to amplitude.
         largest_way = max(self._reachable + self._amplitude, SMALLEST_RANGE)
