@@ -337,6 +337,10 @@ class TestPredictiveController:
         least = minimum_variance(Parameters(noise_variance=0.5, **plant))
         assert runs.output[100:].var() == pytest.approx(least, rel=0.03)
 
+    def test_random_set_points_without_amplitude_are_a_constant(self):
+        runs = run_mpc(1, 200, setpoint="random", setpoint_amplitude=0.0, setpoint_period=60)
+        assert mean_error(runs) == 0.0
+
     def test_zeros_in_b_are_a_delay(self):
         b, case = Parameters().b, {"samples": 400, "setpoint": 5.0}
         delayed = mean_error(run_mpc(1, **case))

@@ -144,7 +144,7 @@ class PredictiveController:
         self._models: dict[int, _Model] = {}  # by the sample from which the coefficients hold
         self._random: RandomSetpoint | None = None
         levels = Levels(parameters)
-        if levels.random:
+        if levels.random and levels.amplitude > 0.0:
             self._random = RandomSetpoint(levels.shortest, levels.longest, levels.amplitude)
             deviation = self._forecast_deviation()
             self._deviation = np.maximum(deviation, SMALL_DEVIATION)
