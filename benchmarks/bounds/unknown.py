@@ -1,47 +1,48 @@
-"""Bound the mean error from below by what no command can counteract in time.
+"""Bound the mean absolute error from below by the effects that no flow can counteract in time.
 
 The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k), with
-the output y, the flow u_a, the delay d and the white noise xi. A load disturbance w(k) adds
-A(1) w(k) to the right side. The load is the sum of a random walk and of a piecewise constant
-part, whose changes are called *jumps*.
+the output y, the flow u_a, the delay d and the white noise xi. A load w(k) adds A(1) w(k) to
+the right side. The load is the sum of a random walk and of a piecewise constant part, whose
+changes are called *jumps*.
 
-A flow applied at sample j affects y(j + d + 1) at the earliest, and is chosen without knowledge
-of what happens after j. So no flow counteracts what the last d + 1 samples of the noise xi, of
-the load's walk and of the load's jumps do to y(k). Let n(k) be the sum of these effects, degC.
-The error is
+A flow at sample j affects the output y(j + d + 1) at the earliest. So no flow counteracts the
+effects on y(k) of noise, walk and jumps after the sample k - d - 1. Let n(k) be the sum of these
+effects, degC, and m(k) the error that there would be if n(k) were 0. The error is
 
-    e(k) = m(k) - n(k),    m(k): the error that there would be with n(k) = 0.
+    e(k) = m(k) - n(k).
 
-The number m(k) is known at the sample k - d - 1. The linear program in `linear_program.py`
-needs a lower bound of E|m - n| that is a convex, piecewise linear function of E[m]. As n has
-the mean 0, E[m] is the mean of e. For every slope s, and whatever is known at k - d - 1,
+The number m(k) is known at k - d - 1, and n(k) has the mean 0. The linear program in
+`linear_program.py` needs a lower bound of E|m - n| that is a convex, piecewise linear function
+of E[m]. Let K be everything that is known at k - d - 1. For every slope s,
 
-    E[|m - n| given what is known] >= s m + min over x of E[|x - n| - s x given what is known].
+    E[|m - n| given K] >= s m + min over x of E[|x - n| - s x given K].
 
-The mean of the inequality over everything that can be known is a line in E[m]:
-E|m - n| >= s E[m] + a(s), where the intercept a(s) is the mean of the minima over x. As the
-slope s is the same in all minima, the line is valid whatever m depends on. Three steps lead to
-a number below a(s) that can be computed:
+The mean of this inequality over K is a line in E[m],
 
-1. More is assumed to be known than any controller knows: the load up to the sample k - d - 1,
-   as its walk and its piecewise constant part. *When* the load jumps after k - d - 1 is not
-   known, so the minimum is over a single x for all times of jumps. If the transmitter is noisy,
-   the true output is not assumed to be known: for a known load, output and readings are jointly
-   normal, and the noise in n has the variance of the best prediction of the output from the
-   readings (Kalman filter), whatever the readings are.
-2. The distribution of n then depends on a single known number, the level l of the piecewise
-   constant load at k - d - 1, as the first jump replaces l by a new level. So n is the product
-   of l and a random factor, plus a random number that does not depend on l, and |x - n| - s x
-   is convex in x and l together. Therefore the minimum over x is a convex function of l, and
-   the mean of the minimum over a slice of levels is at least the minimum at the mean level of
-   the slice (Jensen's inequality).
+    E|m - n| >= s E[m] + a(s),
+
+where the intercept a(s) is the mean of the minima over x. Three steps lead to a number below
+a(s) that can be computed:
+
+1. K is taken to contain more than any controller knows: the walk and the piecewise constant part
+   of the load up to k - d - 1. K does not contain the times of later jumps, so the minimum is
+   over a single x for all times of jumps. If the transmitter is noisy, K does not contain the
+   true output. For a known load, output and readings are jointly normal, so the noise in n has
+   the variance of the best prediction of the output from the readings (Kalman filter).
+2. The distribution of n then depends only on the level l of the piecewise constant part at
+   k - d - 1. As the first jump replaces l by a new level, n is the product of l and a random
+   factor, plus a random number that does not depend on l. So |x - n| - s x is convex in x and l
+   together, and its minimum over x is a convex function of l. The mean of such a function over
+   a slice of levels is at least its value at the mean level of the slice (Jensen's inequality).
 3. Each normal or uniform distribution is replaced by atoms, the means of equally probable
-   slices. A sum of distributions is reduced to fewer atoms, the means of neighbouring atoms.
-   Both replacements make the mean of |x - n| smaller (Jensen's inequality).
+   slices. In a sum of distributions, neighbouring atoms are replaced by their mean. Replacing
+   random numbers by their means makes the mean of |x - n| smaller (Jensen's inequality).
 
-After step 3, n has finitely many values, and the minimum over x is at one of them, a quantile.
+After step 3, n has finitely many values, and the minimum over x is at one of these values, a
+quantile.
 
-The bound does not count that no controller can measure the load: see `hidden.py`.
+The lower bound holds for a controller that knows the load, although no controller can measure
+the load: see `hidden.py`.
 """
 
 import math
