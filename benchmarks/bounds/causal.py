@@ -1,7 +1,7 @@
 """Penalise flows that use the future, to bound the cost of not knowing the next set point.
 
 With the environment's argument `setpoint="random"`, the set point is piecewise constant with a
-known distribution. Its *levels*, the values between changes, are independent and uniformly
+known distribution. The *levels*, the values between changes, are independent and uniformly
 distributed in [-A, A]. The number of samples for which a level lasts is uniformly distributed
 from S to L. The *age* of a level is the number of samples since the level began.
 
@@ -12,27 +12,27 @@ E[pi(j) | set points up to j] = 0, it follows that
     E[sum_j pi(j) u_a(j)] = 0.
 
 Hence the expected sum of errors |e(k)| of a controller without preview equals the expected sum
-of |e(k)| + pi(k) u_a(k). For fixed set points, the sum of |e(k)| + pi(k) u_a(k) is at least its
-minimum over all flows, even flows that use the future. So the mean over the set points of these
-minima is a lower bound (D. B. Brown, J. E. Smith and P. Sun, "Information relaxations and
-duality in stochastic dynamic programs", Operations Research 58, 2010, 785-801). Every pi gives
-a valid bound, but a poor choice of pi makes the bound loose. The choice of pi in this module is
+of |e(k)| + pi(k) u_a(k). For fixed set points, the sum of |e(k)| + pi(k) u_a(k) has a minimum
+over all flows, even flows that use the future. The mean of these minima over random set points
+is a lower bound for every controller without preview (D. B. Brown, J. E. Smith and P. Sun,
+"Information relaxations and duality in stochastic dynamic programs", Operations Research 58,
+2010, 785-801). Every pi gives a valid bound, but a poor choice of pi makes the bound loose. The
+choice of pi in this module is
 
     pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
 
 G[k, j] is the effect of the flow u_a(j) on the output y(k). The *slope* g(k) is a rough
 estimate of how fast E|e(k)| rises with the expected error at k, in degC per degC. A formula
 gives the conditional means of g(k). After a change of the set point, g is the sign of the
-change until the output can have reached the new level. At later ages of the level, g is a
-number between -1 and 1, which weighs staying at the present level against moving towards 0, the
-mean of the next level. A level of the opposite sign has the opposite g.
+change until the output can have reached the new level. Then g is a number between -1 and 1,
+which weighs staying at the present level against moving towards 0, the mean of the next level.
 """
 
 import numpy as np
 import scipy  # loads its modules on first use
 from numpy.typing import NDArray
 
-from benchmarks.bounds.linear_program import Unknown, equations, response
+from benchmarks.bounds.linear_program import ErrorBounds, equations, response
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import held
 from mptc_gym.plant.signals import Levels
@@ -61,11 +61,12 @@ class SetPointLaw:
     ----------
     model
         The plant, for all samples of an episode.
-    unknown
-        The lower bounds of E|m - n| for this plant, from which the size of the noise follows.
+    bounds
+        The lower bounds of the mean errors for this plant, from which the size of the noise
+        follows.
     """
 
-    def __init__(self, model: LinearModel, unknown: Unknown) -> None:
+    def __init__(self, model: LinearModel, bounds: ErrorBounds) -> None:
         samples = len(model.load)
         parameters = model.parameters
         at_start = LinearModel(parameters, model.numbers, 0)
@@ -81,7 +82,7 @@ class SetPointLaw:
         self._reachable = gain * min(-low, high)
         # Noise makes the sign of a small error uncertain. Equally probable thresholds of the
         # error, degC, represent the noise: quantiles of the magnitude of a normal number.
-        deviation = unknown.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
+        deviation = bounds.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
         shares = (np.arange(THRESHOLDS) + 0.5) / THRESHOLDS
         self._thresholds = np.zeros(1)
         if deviation > 0.0:
@@ -141,13 +142,13 @@ class SetPointLaw:
         Parameters
         ----------
         ages
-            Samples since the level began at which g is wanted, all later than `known_age`.
+            Ages of the level at which g is wanted, samples, all above `known_age`.
         known_age
-            Samples since the level began up to which the level is known not to change.
+            Age up to which the level is known not to change, samples.
         slope_if_held
             The slope g by age if the level never changes, shape (samples,).
         change_sums
-            The sums of mean slopes after the next change; see `_sums_after_next_change`.
+            What `_sums_after_next_change` returns for the level.
 
         Returns
         -------
@@ -166,8 +167,8 @@ class SetPointLaw:
         """Return the slope g after a change of the set point, by age, shape (samples,).
 
         The set point changes from `previous_level` to `level`, degC. The slope is the sign of
-        the change times the probability that the error is larger than the noise, and 0 after
-        the output has arrived at the new level.
+        the change times the probability that the error is larger than the noise. The slope is 0
+        after the output has arrived at the new level.
         """
         change = level - previous_level
         way = max(self._reachable - np.sign(change) * previous_level, 0.0)
@@ -180,7 +181,7 @@ class SetPointLaw:
         """Return the mean of `_slope_after_change` over all next levels, shape (samples,).
 
         The set point changes from `level`, degC, to a next level that is uniformly distributed.
-        The mean slopes are by the age of the next level.
+        Element i is the mean slope at the age i of the next level.
         """
         A = self._amplitude
         progress = self._progress[:, np.newaxis]
@@ -196,9 +197,9 @@ class SetPointLaw:
     def _sums_after_next_change(self, level: float) -> Array:
         """Return cumulative sums of the mean slope g after the next change from `level`, degC.
 
-        The element `longest + 1 + i` is the sum from the change to i samples later, for a
-        change at a known sample. The first `longest + 1` elements are 0, for the time before
-        the change.
+        The element `longest + 1 + i` is the sum over the samples from the change to i samples
+        after the change. The first `longest + 1` elements, for samples before the change, are
+        0.
         """
         # After a second change, the mean slope is 0, as levels are symmetric around 0.
         mean_slope = self._mean_slope_after_change(level) * self._probability_held
@@ -207,10 +208,10 @@ class SetPointLaw:
     def _slope_after_arrival(self, change_sums: Array) -> Array:
         """Return the slope g at ages after the output's arrival, by age, shape (samples,).
 
-        With these slopes, an additional flow at any of these ages does not change the expected
-        error: the sum over later ages of the impulse response times the mean of g is 0. The
-        equations are solved from the highest age of a level down to the lowest. `change_sums`
-        are the sums of mean slopes after the next change; see `_sums_after_next_change`.
+        The slopes solve one equation for each age: an additional flow that acts from this age
+        on does not change the expected error. So the sum over later ages of the impulse
+        response times the mean of g is 0. The highest age comes first. `change_sums` is what
+        `_sums_after_next_change` returns.
         """
         samples = len(self._probability_held)
         slope = np.zeros(samples)

@@ -1,4 +1,4 @@
-"""Compute with discrete distributions, one for each sample of an episode."""
+"""Add, mix and simplify discrete distributions, for all samples of an episode at once."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -58,7 +58,8 @@ def uniform(half_width: Array, atoms: int) -> Distribution:
 def sum_of(first: Distribution, second: Distribution, atoms: int) -> Distribution:
     """Return the distribution of the sum of two independent random numbers, for each sample.
 
-    The distribution is reduced to `atoms` atoms, a divisor of the number of all sums.
+    `atoms` is the number of atoms of the result. The number must divide the product of the
+    numbers of atoms of `first` and `second`.
     """
     samples = len(first.values)
     values = first.values[:, :, np.newaxis] + second.values[:, np.newaxis]
@@ -81,7 +82,7 @@ def mixture(parts: Sequence[Distribution], probabilities: Sequence[Array]) -> Di
 
 
 def in_ascending_order(distribution: Distribution) -> Distribution:
-    """Return the same distribution with the values of each sample in ascending order."""
+    """Return a distribution with the values of each sample in ascending order."""
     # A stable sort is fast where the values are a few ascending rows one after another.
     order = np.argsort(distribution.values, axis=1, kind="stable")
     values = np.take_along_axis(distribution.values, order, axis=1)
@@ -92,8 +93,8 @@ def in_ascending_order(distribution: Distribution) -> Distribution:
 def reduced(distribution: Distribution, atoms: int) -> Distribution:
     """Return a distribution with fewer atoms, the means of groups of neighbouring atoms.
 
-    For each sample, `atoms` atoms remain. The number `atoms` must divide the number of atoms of
-    `distribution`.
+    `atoms` is the number of atoms that remain for each sample, a divisor of the number of atoms
+    of `distribution`.
     """
     ascending = in_ascending_order(distribution)
     groups = len(distribution.values), atoms, -1  # shape (samples, atoms, atoms of a group)

@@ -5,61 +5,58 @@ the plant's delay. A real controller has only the transmitter's readings, in whi
 the load. No lower bound is known for controllers that have only readings, so this module
 estimates their least possible error. Reports show the estimate as "hidden load".
 
-The estimate is the bound plus a difference of two errors. Both errors are least possible errors
-for a normally distributed load with the variances and correlations of the real load. With a
-normal load, the unknown part of the output y(k) is normal, and a Kalman filter gives its
-variance. The first error is for controllers that have only readings, and the second error is
-for controllers that know the load up to k - d - 1. Both errors are too large for a load that
-jumps, which is zero most of the time and large otherwise, but most of this excess cancels in
-the difference.
+The estimate is the bound plus the increase of the least possible error from a known load to a
+hidden load, for a load that is normally distributed with the variances and correlations of the
+real load. With a normal load, the unknown part of the output y(k) is normal, and a Kalman
+filter gives the variance of this part. A load that jumps causes smaller errors than a normal
+load with the same variance, but most of this difference cancels when the two least possible
+errors are subtracted.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.bounds.linear_program import Unknown
+from benchmarks.bounds.linear_program import ErrorBounds
 from benchmarks.bounds.prediction import (
     filtered_covariance,
     noise_covariance,
     predicted_variance,
 )
-from benchmarks.bounds.unknown import unknown_of_normal
+from benchmarks.bounds.unknown import bounds_for_normal
 from benchmarks.loop.linear import LOAD_STEPS, LinearModel
 from mptc_gym.plant.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
 
-def unknown_of_normal_load(model: LinearModel) -> Unknown:
-    """Return the lower bounds of E|m(k) - n(k)| for a normal load that is known.
+def bounds_with_known_load(model: LinearModel) -> ErrorBounds:
+    """Return the lower bounds of the mean errors at k for a load that is known up to k - d - 1.
 
-    The load is known up to k - d - 1, where d is the plant's delay. Here n(k) is the part of
-    the output that is then unknown, and m(k) the error without n(k). `model` is the plant, for
-    the samples of an episode.
+    Here d is the plant's delay, and the load is taken to be normal. `model` is the plant, for
+    the samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)
     filtered = np.zeros_like(F)  # A known load has no variance.
     filtered[:, :LOAD_STEPS, :LOAD_STEPS] = noise_covariance(model)
-    return unknown_of_normal(predicted_variance(filtered, F, Q, model.lag))
+    return bounds_for_normal(predicted_variance(filtered, F, Q, model.lag))
 
 
-def unknown_of_hidden_load(model: LinearModel) -> Unknown:
-    """Return the lower bounds of E|m(k) - n(k)| for a normal load that cannot be measured.
+def bounds_with_hidden_load(model: LinearModel) -> ErrorBounds:
+    """Return the lower bounds of the mean errors at k for readings up to k - d - 1 alone.
 
-    Only the transmitter's readings up to k - d - 1 are known, where d is the plant's delay.
-    Here n(k) is the part of the output that is then unknown, and m(k) the error without n(k).
-    `model` is the plant, for the samples of an episode.
+    Here d is the plant's delay, and the load is unknown and taken to be normal. `model` is the
+    plant, for the samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)
     filtered = filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
-    return unknown_of_normal(predicted_variance(filtered, F, Q, model.lag))
+    return bounds_for_normal(predicted_variance(filtered, F, Q, model.lag))
 
 
 def _with_load(model: LinearModel) -> tuple[Array, Array]:
     """Return F(k) and Q(k) of x(k) = F(k) x(k-1) + v(k) for a plant with a normal load.
 
-    The state x(k) is that of `LinearModel.state_space_with_load`, and v(k) is white with the
-    covariance Q(k). F and Q have the shape (samples, size, size), for the samples of `model`.
+    The state x(k) is the state of `LinearModel.state_space_with_load`, and v(k) is white with
+    the covariance Q(k). F and Q have the shape (samples, size, size).
     """
     numbers = model.numbers
     k = np.arange(len(model.load))

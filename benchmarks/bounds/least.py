@@ -2,9 +2,10 @@
 
 The mean error is the mean of |e(k)| over the samples k = 1 to N of an episode, where e(k) is
 the set point minus the output, degC. The file README.md says for which controllers each kind of
-bound holds. At sample k, these controllers may know the plant's parameters, and the
-transmitter's readings, the set points and the loads up to k. They know neither the true output,
-`info["output"]`, nor the time of the load's next jump. They may compensate the dead zone.
+bound holds. At sample k, a controller may know the plant's parameters, and the transmitter's
+readings, the set points and the loads up to k. A controller knows neither the true output,
+`info["output"]`, nor the time of the load's next jump. A controller may compensate the dead
+zone.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,9 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.bounds.causal import SetPointLaw
-from benchmarks.bounds.hidden import unknown_of_hidden_load, unknown_of_normal_load
-from benchmarks.bounds.linear_program import LOOKAHEAD, TRAVEL_PRICE, Unknown, plan, reference
-from benchmarks.bounds.unknown import unknown
+from benchmarks.bounds.hidden import bounds_with_hidden_load, bounds_with_known_load
+from benchmarks.bounds.linear_program import (
+    LOOKAHEAD,
+    TRAVEL_PRICE,
+    ErrorBounds,
+    plan,
+    reference,
+)
+from benchmarks.bounds.unknown import error_bounds
 from benchmarks.lib.errors import NoBoundError
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.loop.linear import LinearModel
@@ -47,7 +54,7 @@ KINDS = "preview", "causal", "reference"
 class LeastPossible(Estimate):
     """The least possible mean |e| of a case, degC, with a 95 % interval over random episodes.
 
-    If the least error is the same in all episodes, both ends of the interval equal `value`.
+    If the least error is the same in all episodes, `low` and `high` equal `value`.
     """
 
     kind: str  # one of `KINDS`
@@ -97,11 +104,12 @@ def least_possible(
     samples
         N, the length of an episode.
     kind
-        One of `KINDS`. With None, the kind is "causal" for random set points, and "reference"
-        for all others; but "preview" if the case has no reference or if the set point never
-        changes. Reports and `mptc_gym.evaluate` use these kinds.
+        One of `KINDS`. With None, as in reports and in `mptc_gym.evaluate`, the kind is
+        "causal" for random set points, "preview" for constant set points, and otherwise
+        "reference", or "preview" if the case has no reference.
     episodes
-        Number of episodes over which the bound is averaged, if it differs between episodes.
+        Number of episodes over which the least error is averaged, if plants or set points are
+        random.
     seed
         Seed of the first episode: episode i is the environment's episode with the seed
         `seed + i`.
@@ -153,7 +161,7 @@ def with_hidden_load(
     """Return an estimate of the least possible mean |e(k)| if nobody measures the load, degC.
 
     The estimate is not a bound: see `hidden.py`. For a case without a load, the result is the
-    least possible error. The parameters and exceptions are those of `least_possible`.
+    least possible error. `least_possible` describes the parameters and exceptions.
     """
     least = least_possible(
         samples=samples, kind=kind, episodes=episodes, seed=seed, **arguments
@@ -165,8 +173,8 @@ def with_hidden_load(
     estimates = []
     for i, bound in enumerate(least.episodes):
         episode = parameters, least.kind, drawn.numbers[i], drawn.setpoints[i]
-        hidden_load = _error_sum(*episode, unknown_of_hidden_load)
-        known_load = _error_sum(*episode, unknown_of_normal_load)
+        hidden_load = _error_sum(*episode, bounds_with_hidden_load)
+        known_load = _error_sum(*episode, bounds_with_known_load)
         estimates.append(bound + (hidden_load - known_load) / samples)
     return student(estimates)
 
@@ -181,7 +189,7 @@ class _Episodes(NamedTuple):
 
 
 def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
-    """Return the episodes with seeds from `seed` on, each of N = `samples` samples."""
+    """Return the environment's episodes with the seeds `seed`, `seed + 1` and so on."""
     numbers = drawn_numbers(parameters, episodes, seed)
     with closing(make_plants(episodes, samples + 1, **asdict(parameters))) as plants:
         idle_valve = IdleValve(numbers.u_min, numbers.u_max)
@@ -197,9 +205,9 @@ def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Ep
 def _bound(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
-    """Return the least possible error of a kind; the parameters are those of `least_possible`.
+    """Return the least possible error for one of `KINDS`; a NoBoundError is raised without one.
 
-    A NoBoundError is raised if a reference does not exist.
+    `least_possible` describes the parameters.
     """
     if not is_random(parameters):
         episodes = 1
@@ -221,7 +229,7 @@ def _error_sum(
     kind: str,
     numbers: PlantNumbers[float],
     setpoint: Array,
-    unknown_of: Callable[[LinearModel], Unknown] = unknown,
+    bounds_of: Callable[[LinearModel], ErrorBounds] = error_bounds,
 ) -> float:
     """Return the least possible sum of |e(k)| over k = 1 to N in one episode, degC.
 
@@ -239,21 +247,21 @@ def _error_sum(
         The plant numbers of the episode.
     setpoint
         Set points y_d(k) for k = 0 to N, degC, shape (N + 1,).
-    unknown_of
-        Function that returns the lower bounds of the mean absolute errors for a plant.
+    bounds_of
+        A function that returns the lower bounds of the mean errors for a plant.
     """
     length = len(setpoint)
     if kind == "reference":  # A reference looks beyond the end of the episode.
         length += int(numbers.delay) + len(parameters.b) + LOOKAHEAD
     model = LinearModel(parameters, numbers, np.arange(length))
-    unforeseen = unknown_of(model)
+    bounds = bounds_of(model)
     if kind == "reference":
-        errors, flow = reference(model, unforeseen, setpoint)
+        errors, flow = reference(model, bounds, setpoint)
         costs = TRAVEL_PRICE * np.abs(np.diff(flow, prepend=0.0))
     else:
         penalty = np.zeros(len(setpoint))
         if kind == "causal" and parameters.setpoint_amplitude > 0.0:
-            penalty = SetPointLaw(model, unforeseen).penalty(setpoint)
-        errors, flow = plan(model, unforeseen, setpoint, penalty=penalty)
+            penalty = SetPointLaw(model, bounds).penalty(setpoint)
+        errors, flow = plan(model, bounds, setpoint, penalty=penalty)
         costs = penalty * flow
     return float(errors[1:].sum() + costs.sum())  # without e(0), which no flow changes

@@ -36,24 +36,22 @@ TRAVEL_PRICE = 1e-4
 
 
 @dataclass(frozen=True)
-class Unknown:
-    """Lower bounds of the mean error E|m - n| at each sample, as functions of |E[m]|.
+class ErrorBounds:
+    """Lower bounds of the mean absolute error E|e| at each sample, as functions of |E[e]|.
 
-    Here n is the part of the output, degC, that no flow can counteract in time, and m the error
-    without n; see `unknown.py`. The bound is the highest of several lines, each of which is
-    intercept + slope * |E[m]|.
+    A bound is the highest of several lines, intercept + slope * |E[e]|; see `unknown.py`.
     """
 
-    # The slopes of the lines, ascending from 0 to 1, shape (slopes,). If nothing is unknown, n
-    # is 0, and the only slope is 1.
+    # The slopes of the lines, ascending from 0 to 1, shape (slopes,). If neither noise nor load
+    # is random, the only slope is 1.
     slopes: Array
     intercepts: Array  # of the lines at each sample, degC, shape (samples, slopes)
 
     def mean_error(self, expected_errors: Array) -> Array:
-        """Return the lower bounds of the mean absolute errors for given expected errors, degC.
+        """Return the lower bounds of the mean absolute errors E|e|, degC, shape (count,).
 
-        `expected_errors` holds the expected errors E[m] of the first samples, degC, shape
-        (count,). The bounds have the shape (count,).
+        `expected_errors` holds the expected errors E[e] of the first samples, degC, shape
+        (count,).
         """
         magnitudes = np.abs(expected_errors)[:, np.newaxis]
         lines = self.intercepts[: len(expected_errors)] + self.slopes * magnitudes
@@ -103,7 +101,7 @@ def response(A: Any, B: Any) -> Array:
 
 
 class Plan(NamedTuple):
-    """A mean flow that makes the sum of the bounds of the errors small, and the bounds."""
+    """Mean flows of an episode, and the bounds of the mean errors that the flows cause."""
 
     errors: Array  # lower bounds of E|e(k)|, degC, shape (samples,)
     flow: Array  # the mean of u_a(k), t/h, shape (samples,)
@@ -111,7 +109,7 @@ class Plan(NamedTuple):
 
 def plan(
     model: LinearModel,
-    unknown: Unknown,
+    bounds: ErrorBounds,
     setpoint: Array,
     *,
     past: ArrayLike = (),
@@ -121,16 +119,16 @@ def plan(
     """Return the mean flow for which the sum of the bounds of the errors is least.
 
     The least sum is a lower bound for every controller, even for a controller that knows the
-    future. To see this, let y and u be the means of output and applied flow over all noise,
-    load and randomness of the controller:
+    future. The proof uses y and u, the means of output and applied flow over all noise, loads
+    and random decisions of a controller:
 
     - Equation (28) of the paper is linear, so y and u satisfy equation (28) without noise.
-    - The flow always lies within the limits of the actuator, so u does, too.
-    - The expected error is y_d - y, the set point minus the mean output, and `unknown` gives a
-      lower bound of the mean absolute error for each expected error.
+    - The flow always lies within the limits of the actuator, so u lies within the limits.
+    - The expected error is the set point minus y, and `bounds` gives a lower bound of the mean
+      absolute error for each expected error.
 
-    So the controller's mean error is at least the minimum over all u within the limits. The
-    minimum is the solution of a linear program, as each bound is a maximum of lines.
+    So the controller's mean error is at least the minimum of the bounds over all u within the
+    limits. The minimum is a linear program, as each bound is a maximum of lines.
 
     The bound is loose where the required flow lies inside the dead zone: the mean of the flows
     0 and 5 t/h is 2.5 t/h, which no valve with a dead zone of 5 t/h passes. The bound is also
@@ -140,7 +138,7 @@ def plan(
     ----------
     model
         The plant, for at least as many samples as `setpoint` has.
-    unknown
+    bounds
         The lower bounds of the mean absolute errors for this plant.
     setpoint
         Set points y_d(k), degC, shape (samples,).
@@ -164,13 +162,13 @@ def plan(
     flow[:decided] = past
     if decided < samples - 1:
         price = np.broadcast_to(np.asarray(penalty, float), samples)
-        program = _program(model, unknown, setpoint, flow, decided, quiet, price)
+        program = _program(model, bounds, setpoint, flow, decided, quiet, price)
         flow[decided:-1] = _solve(program, zeros=np.roots(model.parameters.b))
     if samples > 1:
         flow[-1] = flow[-2]  # The last flow affects no output; it costs nothing if it stays.
     A, B = equations(model, samples)
     output = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
-    return Plan(unknown.mean_error(setpoint - output), flow)
+    return Plan(bounds.mean_error(setpoint - output), flow)
 
 
 class _Variables(NamedTuple):
@@ -182,10 +180,9 @@ class _Variables(NamedTuple):
 
 
 def _variables(count: int, cost: Any, low: Any, high: Any) -> _Variables:
-    """Return `count` variables of a linear program.
+    """Return `count` variables of a linear program, with numbers repeated for all variables.
 
-    `cost` is the cost of each unit of a variable, and `low` and `high` are the bounds of the
-    variables. Each is an array of shape (count,), or a number for all variables.
+    `cost`, `low` and `high` are arrays of shape (count,), or numbers.
     """
     return _Variables(*(np.broadcast_to(values, count) for values in (cost, low, high)))
 
@@ -193,12 +190,12 @@ def _variables(count: int, cost: Any, low: Any, high: Any) -> _Variables:
 class _Program(NamedTuple):
     """The linear program of `plan` for the n flows that are not decided yet.
 
-    The outputs y and the flows u satisfy A y = B u. The expected error m(k) is a sum of pieces
-    above 0 and pieces below 0, one of each for every slope of its bound. The first n targets
-    are the set points minus the effects of past flows: target k equals output k, plus the
-    pieces of m(k) above 0, minus the pieces of m(k) below 0. A quiet plan, which limits valve
-    travel, has n more targets: each equals flow k minus flow k - 1, minus the move up, plus the
-    move down. These n targets are 0, except the first, which is the last past flow.
+    The outputs y and the flows u satisfy A y = B u. The expected error at k is the sum of
+    positive pieces minus the sum of negative pieces. There is a piece of each sign for every
+    slope of the bound. The first n targets are the set points minus the effects of past flows:
+    target k equals output k plus the expected error at k. A quiet plan, which limits valve
+    travel, has n more targets: target n + k equals flow k minus flow k - 1, minus the move up,
+    plus the move down. Target n is the last past flow, and the targets after n are 0.
     """
 
     A: Any  # sparse matrix of the plant, shape (n, n)
@@ -206,13 +203,14 @@ class _Program(NamedTuple):
     targets: Array  # right sides, shape (n,), or (2 n,) in a quiet plan
     outputs: _Variables  # the effects of the flows on the outputs, degC, n variables
     flows: _Variables  # t/h, n variables
-    pieces: _Variables  # pieces of m, degC: for each slope, n above 0 and then n below 0
+    # Pieces of the expected errors, degC: for each slope, n positive and n negative pieces.
+    pieces: _Variables
     moves: _Variables  # t/h: n moves up and n moves down in a quiet plan, otherwise none
 
 
 def _program(
     model: LinearModel,
-    unknown: Unknown,
+    bounds: ErrorBounds,
     setpoint: Array,
     flow: Array,
     decided: int,
@@ -223,7 +221,7 @@ def _program(
 
     Parameters
     ----------
-    model, unknown, setpoint, quiet
+    model, bounds, setpoint, quiet
         Arguments of `plan`.
     flow
         The flows that are decided, and 0 for all later flows, t/h, shape (samples,).
@@ -238,7 +236,7 @@ def _program(
     A, B = equations(model, samples)
     output_of_past = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
     targets = (setpoint - output_of_past)[first:]
-    slopes = unknown.slopes
+    slopes = bounds.slopes
     moves = 0
     if quiet:
         # A line may be level near an error of 0, where a quiet plan needs a slope.
@@ -247,7 +245,7 @@ def _program(
         targets = np.concatenate([targets, [last_flow], np.zeros(n - 1)])
         moves = 2 * n
     # In the order of `_Program.pieces`.
-    lengths = np.repeat(unknown.lengths[first:samples], 2, axis=1).T.ravel()
+    lengths = np.repeat(bounds.lengths[first:samples], 2, axis=1).T.ravel()
     return _Program(
         A=A[first:, first:],
         B=B[first:, decided:-1],
@@ -260,12 +258,12 @@ def _program(
 
 
 def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
-    """Return the flows with the least cost, t/h, shape (n,).
+    """Return the flows of a linear program with the least cost, t/h, shape (n,).
 
     Parameters
     ----------
     program
-        The linear program.
+        The linear program, with n flows.
     zeros
         The zeros of the polynomial B in equation (28) of the paper.
 
@@ -307,9 +305,9 @@ def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
 def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
     """Return the equality constraints of a program: a matrix M and a vector r with M x = r.
 
-    The vector x holds all variables of `program`: outputs, if `with_outputs`, then flows,
-    pieces and moves. Without outputs among the variables, an output is expressed as the sum of
-    the effects of the flows. M is sparse.
+    The vector x holds the flows, pieces and moves of `program`, after the outputs if
+    `with_outputs` is true. If `with_outputs` is false, the equations contain the effects of the
+    flows in place of the outputs. M is sparse.
     """
     n = len(program.flows.cost)
     rows = len(program.targets)
@@ -336,21 +334,19 @@ def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
     return scipy.sparse.block_array(blocks).tocsc(), right
 
 
-def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
+def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
     """Return the plan of a controller that never expects another change of the set point.
 
-    A controller may have the times of all changes of a square wave or a list of set points
-    built in. So the only lower bound for such set points is the bound for controllers that know
-    the future, and the reference shows what other controllers can reach. At each change of the
-    set point, the controller chooses the flow that is best if the new set point stays for ever.
-    If the plant has settled before the next change, no controller that is surprised by the
-    change can have a smaller error after it.
+    At each change of the set point, the controller chooses the flow that is best if the new set
+    point stays for ever. If the plant has settled before each change, no controller that is
+    surprised by the changes has a smaller error. The reference is not a lower bound, since a
+    controller can have the times of all changes of a square wave built in.
 
     Parameters
     ----------
     model
         The plant, for `model.lag + LOOKAHEAD` samples more than `setpoint` has.
-    unknown
+    bounds
         The lower bounds of the mean absolute errors for this plant.
     setpoint
         Set points y_d(k), degC, shape (samples,).
@@ -358,7 +354,7 @@ def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
     Raises
     ------
     NoBoundError
-        If the plant has not settled when the set point changes.
+        If the set point changes before the plant has settled.
     RuntimeError
         If no solver solves a linear program within `TIME_LIMIT`.
     """
@@ -371,7 +367,7 @@ def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
         if not is_last:
             beyond = np.full(model.lag + LOOKAHEAD, setpoint[start])
             expected_setpoint = np.concatenate([expected_setpoint, beyond])
-        planned = plan(model, unknown, expected_setpoint, past=flow[:start], quiet=True)
+        planned = plan(model, bounds, expected_setpoint, past=flow[:start], quiet=True)
         flow = planned.flow
         errors[start:stop] = planned.errors[start:stop]
         # The range of the flows that affect outputs after the change, t/h.

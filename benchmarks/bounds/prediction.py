@@ -16,21 +16,21 @@ SMALLEST_VARIANCE = 1e-8
 
 
 def noise_variance(model: LinearModel) -> Array:
-    """Return the variance of the best prediction of y(k) for a plant without a load, degC^2.
+    """Return the variance of the error with which an output y(k) without load is predicted.
 
-    The output y(k) is predicted from the transmitter's readings up to k - d - 1, where d is the
-    plant's delay. The shape is (samples,), for the samples k of `model`, a plant.
+    The output y(k) is predicted as well as possible from the transmitter's readings up to
+    k - d - 1, where d is the plant's delay. The variances are in degC^2, shape (samples,), for
+    the samples k of `model`.
     """
     F, Q = noise_system(model)
     return predicted_variance(noise_covariance(model), F, Q, model.lag)
 
 
 def noise_covariance(model: LinearModel) -> Array:
-    """Return the covariances of the state x(k) of a plant without a load, given the readings.
+    """Return the covariances of the state x(k) of a plant without load, given readings up to k.
 
-    The readings up to k are given, and `noise_system` describes the state. The covariances are
-    0 if the transmitter is perfect. The shape is (samples, size, size), for the samples k of
-    `model`.
+    `noise_system` describes the state. The covariances are 0 if the transmitter is perfect. The
+    covariances have the shape (samples, size, size), for the samples k of `model`.
     """
     F, Q = noise_system(model)
     if model.numbers.measurement_noise_variance == 0.0:
@@ -41,9 +41,9 @@ def noise_covariance(model: LinearModel) -> Array:
 def noise_system(model: LinearModel) -> tuple[Array, Array]:
     """Return F(k) and Q(k) of x(k) = F(k) x(k-1) + v(k), the effect of noise on a plant.
 
-    The state x(k) is that of `LinearModel.state_space`, whose first element is the output y(k),
-    degC, and v(k) is white with the covariance Q(k). F and Q have the shape (samples, size,
-    size), for the samples k of `model`.
+    The state x(k) is the state of `LinearModel.state_space`, whose first element is the output
+    y(k), degC. The vector v(k) is white with the covariance Q(k). F and Q have the shape
+    (samples, size, size), for the samples k of `model`.
     """
     F, g = model.state_space()
     covariance = model.numbers.noise_variance * np.outer(g, g)
@@ -92,8 +92,8 @@ def predicted_variance(filtered: Array, F: Array, Q: Array, lag: int) -> Array:
     Returns
     -------
     ndarray
-        Variances of y(k), shape (samples,). The state x(0) is known, so an output before
-        k = lag is predicted from x(0).
+        Variances of y(k), shape (samples,). For k below `lag`, y(k) is predicted from x(0),
+        which is known.
     """
     samples = len(F)
     steps = min(lag, samples)

@@ -6,43 +6,41 @@ the right side. The load is the sum of a random walk and of a piecewise constant
 changes are called *jumps*.
 
 A flow at sample j affects the output y(j + d + 1) at the earliest. So no flow counteracts the
-effects on y(k) of noise, walk and jumps after the sample k - d - 1. Let n(k) be the sum of these
-effects, degC, and m(k) the error that there would be if n(k) were 0. The error is
+effects on y(k) of noise, walk and jumps after the sample k - d - 1. Let n(k) be the sum of
+these effects, degC, and m(k) the error that there would be if n(k) were 0. The error is
 
     e(k) = m(k) - n(k).
 
-The number m(k) is known at k - d - 1, and n(k) has the mean 0. The linear program in
-`linear_program.py` needs a lower bound of E|m - n| that is a convex, piecewise linear function
-of E[m]. Let K be everything that is known at k - d - 1. For every slope s,
+The number m(k) is known at k - d - 1, and n(k) has the mean 0, so E[e] = E[m]. The linear
+program in `linear_program.py` needs a lower bound of E|e| that is a convex, piecewise linear
+function of E[e]. Let K be everything that is known at k - d - 1. For every slope s,
 
     E[|m - n| given K] >= s m + min over x of E[|x - n| - s x given K].
 
-The mean of this inequality over K is a line in E[m],
+The mean of this inequality over K is a line in E[e],
 
-    E|m - n| >= s E[m] + a(s),
+    E|e| >= s E[e] + a(s),
 
 where the intercept a(s) is the mean of the minima over x. Three steps lead to a number below
 a(s) that can be computed:
 
-1. K is taken to contain more than any controller knows: the walk and the piecewise constant part
-   of the load up to k - d - 1. K does not contain the times of later jumps, so the minimum is
-   over a single x for all times of jumps. If the transmitter is noisy, K does not contain the
-   true output. For a known load, output and readings are jointly normal, so the noise in n has
-   the variance of the best prediction of the output from the readings (Kalman filter).
-2. The distribution of n then depends only on the level l of the piecewise constant part at
-   k - d - 1. As the first jump replaces l by a new level, n is the product of l and a random
-   factor, plus a random number that does not depend on l. So |x - n| - s x is convex in x and l
-   together, and its minimum over x is a convex function of l. The mean of such a function over
-   a slice of levels is at least its value at the mean level of the slice (Jensen's inequality).
+1. K is taken to contain more than any controller knows: the walk and the piecewise constant
+   part of the load up to k - d - 1. K does not contain the times of later jumps, so the minimum
+   is over a single x for all times of jumps. If the transmitter is noisy, K does not contain
+   the true output. For a known load, output and readings are jointly normal, so the noise in n
+   has the variance of the best prediction of the output from the readings (Kalman filter).
+2. Given K, the distribution of n depends only on the level l of the piecewise constant part at
+   k - d - 1. The first jump replaces l by a new level. So n is the product of l and a random
+   factor, plus a random number that does not depend on l. Therefore |x - n| - s x is convex in
+   x and l together, and the minimum over x is a convex function of l. The mean of a convex
+   function over a slice of levels is at least the value of the function at the mean level of
+   the slice (Jensen's inequality).
 3. Each normal or uniform distribution is replaced by atoms, the means of equally probable
    slices. In a sum of distributions, neighbouring atoms are replaced by their mean. Replacing
-   random numbers by their means makes the mean of |x - n| smaller (Jensen's inequality).
+   random numbers by their mean never makes the mean of |x - n| larger (Jensen's inequality).
 
 After step 3, n has finitely many values, and the minimum over x is at one of these values, a
 quantile.
-
-The lower bound holds for a controller that knows the load, although no controller can measure
-the load: see `hidden.py`.
 """
 
 import math
@@ -61,7 +59,7 @@ from benchmarks.bounds.distributions import (
     sum_of,
     uniform,
 )
-from benchmarks.bounds.linear_program import Unknown, equations
+from benchmarks.bounds.linear_program import ErrorBounds, equations
 from benchmarks.bounds.prediction import noise_variance
 from benchmarks.loop.linear import LinearModel
 from mptc_gym.plant.signals import LOAD_INTERVAL
@@ -75,16 +73,16 @@ WALK_ATOMS = 4  # of each step of the load's walk
 JUMP_ATOMS = 32  # of the effect of a jump and of later jumps, and of noise in their sum
 JUMP_LEVEL_ATOMS = 8  # of the new level of the load after a jump
 KNOWN_LEVEL_ATOMS = 8  # of the load's level that is known at k - d - 1; an even number
-# Slopes s of the lines that bound E|m - n|; each line touches E|m - n| at a quantile of n. The
-# slopes are closer together near 1, as E|m - n| approaches |m| slowly.
+# Slopes s of the lines that bound the mean error. The slopes are closer together near 1, as the
+# mean error approaches the magnitude of the expected error slowly.
 SLOPES = 1.0 - np.array([64, 53, 42, 31, 22, 14, 8, 4, 1, 0]) / 64.0
 
 
-def unknown(model: LinearModel) -> Unknown:
-    """Return the lower bounds of E|m(k) - n(k)| for each sample k of an episode.
+def error_bounds(model: LinearModel) -> ErrorBounds:
+    """Return the lower bounds of the mean errors that noise and load cause, for each sample.
 
-    Here n(k) is the effect on the output of noise and load that no flow can counteract in time,
-    and m(k) the error without n(k); see the description of the module.
+    No flow can counteract the effects of noise and load in the last d + 1 samples, where d is
+    the plant's delay; see the description of the module. The load is taken to be known.
 
     Parameters
     ----------
@@ -97,7 +95,7 @@ def unknown(model: LinearModel) -> Unknown:
     largest_step = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
     amplitude = numbers.disturbance_amplitude
     if not (largest_step or amplitude):
-        return unknown_of_normal(noise_variance(model))
+        return bounds_for_normal(noise_variance(model))
 
     changes = load_changes(model)
     noise = normal(noise_variance(model), NOISE_ATOMS)
@@ -106,28 +104,29 @@ def unknown(model: LinearModel) -> Unknown:
             step = uniform(largest_step * effect, WALK_ATOMS)
             noise = sum_of(noise, step, NOISE_ATOMS)
     if not amplitude:
-        return Unknown(SLOPES, least_mean_distances(noise, SLOPES))
+        return ErrorBounds(SLOPES, least_mean_distances(noise, SLOPES))
     jump_probability = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval)
-    return Unknown(SLOPES, _intercepts_with_jumps(changes, noise, amplitude, jump_probability))
+    intercepts = _intercepts_with_jumps(changes, noise, amplitude, jump_probability)
+    return ErrorBounds(SLOPES, intercepts)
 
 
-def unknown_of_normal(variance: Array) -> Unknown:
-    """Return the lower bounds of E|m(k) - n(k)| for a normal n(k) with the mean 0.
+def bounds_for_normal(variance: Array) -> ErrorBounds:
+    """Return the lower bounds of the mean errors if the inevitable errors are normal.
 
-    `variance` holds the variance of n(k), degC^2, for each sample, shape (samples,).
+    `variance` holds the variance of the part of the error that no flow can counteract in time,
+    degC^2, for each sample, shape (samples,). This part has the mean 0.
     """
     if not variance.any():
-        return Unknown(np.ones(1), np.zeros((len(variance), 1)))
+        return ErrorBounds(np.ones(1), np.zeros((len(variance), 1)))
     distribution = normal(variance, NOISE_ATOMS)
-    return Unknown(SLOPES, least_mean_distances(distribution, SLOPES))
+    return ErrorBounds(SLOPES, least_mean_distances(distribution, SLOPES))
 
 
 class LoadChanges(NamedTuple):
     """For each sample k, the changes of the load that are not yet known at k - d - 1.
 
-    Here d is the delay of the plant, samples. The load can change at the samples
-    `LOAD_INTERVAL`, 2 `LOAD_INTERVAL` and so on. The unknown changes are those at the samples
-    from k - d to k.
+    Here d is the delay of the plant, samples. The load can change at every multiple of
+    `LOAD_INTERVAL` above 0. The changes at the samples from k - d to k are unknown.
     """
 
     # Change of y(k), degC, for a change of the load by 1 degC, by the place of the change: the
@@ -139,9 +138,9 @@ class LoadChanges(NamedTuple):
 
 
 def load_changes(model: LinearModel) -> LoadChanges:
-    """Return the changes of the load that come too late for a flow to counteract them.
+    """Return the changes of the load that no flow can counteract in time, for each sample.
 
-    `model` is a plant, whose samples are the samples of an episode from k = 0 on.
+    `model` is a plant, for the samples k = 0, 1, ... of an episode.
     """
     samples = len(model.load)
     k = np.arange(samples)
@@ -165,11 +164,10 @@ def load_changes(model: LinearModel) -> LoadChanges:
 def _after_jumps(
     effects: Array, amplitude: float, jump_probability: float
 ) -> list[Distribution]:
-    """Return the distributions of what a first jump of the load and later jumps add to n(k).
+    """Return the distributions of the effect on y(k) of a jump of the load and all later jumps.
 
-    Here n(k) is the effect on y(k) of what cannot be counteracted in time. The load keeps a new
-    level until the next jump replaces the level by another level. The effect of the level
-    before the first jump is not included.
+    The load keeps a new level until the next jump replaces the level by another level. The
+    effect of the level before the first jump is left out.
 
     Parameters
     ----------
@@ -207,17 +205,17 @@ def _after_jumps(
 def _effects_on_output(
     changes: LoadChanges, noise: Distribution, amplitude: float, jump_probability: float
 ) -> tuple[Distribution, Array]:
-    """Return the distribution of n(k) for a load with jumps, and how its values depend on l.
+    """Return the distribution of n(k), the effect on y(k) that no flow can counteract in time.
 
-    Here l is the level of the load at k - d - 1, degC, for the plant's delay d. The parameters
-    are the parameters of `_intercepts_with_jumps`.
+    The distribution depends on l, the level of the load at k - d - 1, degC, where d is the
+    plant's delay. `_intercepts_with_jumps` describes the parameters.
 
     Returns
     -------
     at_level_0 : Distribution
         The distribution of n(k) if l is 0.
     effect_of_level : Array
-        What each degC of l adds to each value of `at_level_0`, shape (samples, atoms).
+        The change of each value of `at_level_0` by each degC of l, shape (samples, atoms).
     """
     no_jump_probability = 1.0 - jump_probability
     # The load does not jump after k - d - 1, or one of the unknown changes is the first jump.
@@ -240,10 +238,10 @@ def _effects_on_output(
 def _intercepts_with_jumps(
     changes: LoadChanges, noise: Distribution, amplitude: float, jump_probability: float
 ) -> Array:
-    """Return the intercepts a(s) of the bounds of E|m - n| for a load with jumps.
+    """Return the intercepts a(s) of the bounds of the mean errors for a load with jumps.
 
-    The intercepts are means over the load's level at k - d - 1, for the plant's delay d. The
-    level is 0 until the first jump of the episode, and uniformly distributed after it.
+    The intercepts are means over the level of the load at k - d - 1, where d is the plant's
+    delay. The level is 0 until the first jump of the episode, and then uniformly distributed.
 
     Parameters
     ----------
