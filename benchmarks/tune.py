@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.controllers.plant_scale import scales
+from benchmarks.controllers.plant_scale import scale_of
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.command import (
@@ -212,8 +212,8 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     limit = max(abs(parameters.range_of("u_min")[1]), abs(parameters.range_of("u_max")[0]))
     noise = sum(parameters.range_of("noise_variance")) / 2.0 / PAPER_NOISE
     if not noise:  # In proportion to the temperatures that the flow reaches, squared.
-        reach = "reach of half the flow's range, °C"
-        noise = (scales(parameters)[reach] / scales(PAPER)[reach]) ** 2
+        scale, paper_scale = scale_of(parameters), scale_of(PAPER)
+        noise = (scale.temperature_range / paper_scale.temperature_range) ** 2
     scaled: dict[str, TuningCase] = {}
     for name, case in CASES.items():
         arguments = {**plant, "setpoint": "square", **case.arguments}

@@ -15,7 +15,8 @@ from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.least import least_possible, with_hidden_load
 from benchmarks.bounds.linear_program import equations, plan, reference, response
-from benchmarks.bounds.unknown import load_changes, noise_variance, unknown
+from benchmarks.bounds.prediction import noise_variance
+from benchmarks.bounds.unknown import error_bounds, load_changes
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
@@ -49,13 +50,13 @@ def course_of(samples, **arguments):
 def best_plan(setpoint, /, **arguments):
     """Return the bounds of the errors and the flow of the plan with preview."""
     of_plant = course_of(len(setpoint), **arguments)
-    return plan(of_plant, unknown(of_plant), np.asarray(setpoint, np.float64))
+    return plan(of_plant, error_bounds(of_plant), np.asarray(setpoint, np.float64))
 
 
 def change(level, samples, **arguments):
     """Return the least sum of |e| after a change from rest at 0 to a level."""
     of_plant, setpoint = course_of(samples + 110, **arguments), np.full(samples, level)
-    return reference(of_plant, unknown(of_plant), setpoint)[0].sum()
+    return reference(of_plant, error_bounds(of_plant), setpoint)[0].sum()
 
 
 def test_responses_to_single_flows_are_those_of_the_plant():
@@ -178,7 +179,7 @@ class TestUnknown:
             "disturbance_amplitude": 3.0, "disturbance_interval": 25.0,
             "disturbance_walk_variance": 0.02,
         }  # fmt: skip
-        bound = unknown(course_of(620, noise_variance=R, **load))
+        bound = error_bounds(course_of(620, noise_variance=R, **load))
         draws, jump = 40_000, 0.4
         known = rng.uniform(-3.0, 3.0, draws)  # the level at k - d - 1
         level, walk, xi = known, np.zeros(draws), np.zeros((3, draws))
@@ -218,7 +219,7 @@ class TestUnknown:
         model = course_of(620, disturbance_amplitude=3.0, disturbance_interval=10.0)
         latest, earlier = load_changes(model).effects[600:].T
         a, b = np.sort([3.0 * latest, 3.0 * np.maximum(earlier - latest, 0.0)], axis=0)[::-1]
-        intercepts = unknown(model).intercepts[600:, 0]
+        intercepts = error_bounds(model).intercepts[600:, 0]
         assert np.all(intercepts <= a / 2 + b**2 / (6 * a) + 1e-12)
         assert np.all(intercepts >= 0.98 * (a / 2 + b**2 / (6 * a)))
 
@@ -230,7 +231,7 @@ class TestCausal:
         samples, plant = 16, {"a": (1.0, -0.6), "b": (-0.24,), "c": (1.0,), "delay": 0}
         case = {"setpoint": "random", "setpoint_period": 15, "noise_variance": 0.1, **plant}
         of_plant = course_of(samples, **case)
-        law = SetPointLaw(of_plant, unknown(of_plant))
+        law = SetPointLaw(of_plant, error_bounds(of_plant))
         past = [-4.0] * 3 + [2.0] * 3
         present = len(past) - 1
         age = present - past.index(past[-1])
@@ -287,7 +288,7 @@ class TestLeastPossible:
             "samples must be an integer": {"samples": 0},
             "episodes must be an integer": {"episodes": 0},
             "kind must be one of": {"kind": "best"},
-            "set point 'square' has no law, got 'causal'": {"kind": "causal"},
+            "set point 'square' is not random, got 'causal'": {"kind": "causal"},
             "delay must be": {"delay": -1},
             "must be held until": {"kind": "reference", "setpoint_period": 100},
         }.items():
@@ -335,6 +336,17 @@ class TestPredictiveController:
         least = minimum_variance(Parameters(noise_variance=0.5, **plant))
         assert runs.output[100:].var() == pytest.approx(least, rel=0.03)
 
+    def test_random_set_points_without_amplitude_are_a_constant(self):
+        runs = run_mpc(1, 200, setpoint="random", setpoint_amplitude=0.0, setpoint_period=60)
+        assert mean_error(runs) == 0.0
+
+    def test_zeros_in_b_are_a_delay(self):
+        b, case = Parameters().b, {"samples": 400, "setpoint": 5.0}
+        delayed = mean_error(run_mpc(1, **case))
+        zeros_in_front = mean_error(run_mpc(1, b=(0.0, 0.0, *b), delay=16, **case))
+        np.testing.assert_allclose(zeros_in_front, delayed, rtol=0.01)
+        assert mean_error(run_mpc(1, b=(0.0,), **case)) == 5.0  # No flow has an effect.
+
     @pytest.mark.parametrize(
         ("plant", "setpoint"),
         [
@@ -346,7 +358,7 @@ class TestPredictiveController:
         controller = PredictiveController(Parameters(**plant), 1)
         believed = []
         plants = make_plants(1, 300, setpoint=setpoint, **plant)
-        watch = lambda k: believed.append(controller._inputs[0, 1])  # noqa: E731
+        watch = lambda k: believed.append(controller._flows[0, 1])  # noqa: E731
         runs = rollout(plants, controller, 300, seed=0, before=watch)
         np.testing.assert_allclose(believed[1:], runs.applied[:-1, 0], rtol=0, atol=1e-5)
         assert len(np.unique(runs.applied[150:].round(3))) == 2  # it switches ...

@@ -21,22 +21,44 @@ from mptc_gym.evaluation import (
     VALIDATION_SEED,
 )
 
+# The heading of the column for each kind of bound.
 HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
-NOTE = (
-    "'With preview' is a lower bound for every controller, even one that knows all set points "
-    "in advance. 'Without preview' is a lower bound for controllers that see a change of the "
-    "set point only when it happens; it exists for random set points, whose distribution is "
-    "known. 'Reference' is the lowest error if the plant has settled before each change and "
-    "the change comes as a surprise; a controller that knows when the changes come can do "
-    "better. If the set point never changes, the three are the same. All three assume that the "
-    "controller knows the present load. 'Hidden load' is an estimate, and no bound, for "
-    "controllers that see the load only through the transmitter. Intervals are 95 % intervals "
-    "over sampled episodes."
-)
-PACKAGE = ROOT / "mptc_gym" / "bounds.json"
-# The package has the bounds of this many episodes after the `EPISODES` of a published score, so
-# that a somewhat longer evaluation can be compared with bounds, too.
-MORE_EPISODES = 20
+HIDDEN_LOAD = "hidden load (estimate)"
+# What the columns of the table mean, by heading. The headings stand in the order of the table.
+COLUMNS = {
+    "idle valve": "the error if the flow stays at 0 t/h.",
+    "with preview": (
+        "a lower bound for every controller, even for a controller that knows all set points "
+        "in advance."
+    ),
+    "without preview": (
+        "a lower bound for controllers that see a set-point change only when it happens. This "
+        "bound exists only for random set points, because it is derived from the distribution "
+        "of the set points."
+    ),
+    "reference": (
+        "the least error of a controller that finds the plant settled at each set-point change "
+        "and does not expect the change. The reference is not a lower bound: a controller that "
+        "knows the times of the changes can have a smaller error. If the set point never "
+        'changes, the reference equals the bound "with preview".'
+    ),
+    HIDDEN_LOAD: (
+        "an estimate of the least error of controllers that see the load only in the readings "
+        "of the transmitter. The bounds and the reference assume that the controller knows the "
+        "present load. The estimate is not a bound."
+    ),
+    "MPC": (
+        "the error of model predictive control, which knows the plant, but neither the load "
+        "nor future set points. The option --mpc adds this column."
+    ),
+}
+INTERVALS = "Numbers in parentheses are 95 % confidence intervals over random episodes."
+
+# The file of the package `mptc_gym` that has the least possible errors of its presets.
+PACKAGE_FILE = ROOT / "mptc_gym" / "bounds.json"
+# A published score has `EPISODES` episodes. The package has the bounds of 20 more episodes, so
+# that a somewhat longer evaluation can also be compared with bounds.
+PACKAGED_EPISODES = EPISODES + 20
 PACKAGED = PRESETS | {
     f"{name}, random set points": {**PRESETS[name], "setpoint": "random"}
     for name in ("paper", "disturbed", "fouling")  # the plants of the data sets
@@ -48,28 +70,29 @@ PACKAGED = PRESETS | {
 class Options:
     """Print the least possible mean error of each case.
 
-    The cases are those of the comparison and the presets, or the cases of another plant.
+    By default, the cases are the cases of the comparison and the presets of the environment.
     """
 
     mpc: Runs | None = None
-    """Also run the predictive controller this many times in each case."""
+    """Add the mean error of model predictive control over this many runs of each case."""
     package: bool = False
-    """Write the bounds of the presets that ship with the package instead."""
+    """Instead of the table, write the file of bounds that ships with the package mptc_gym."""
     fan_out: FanOut = field(default_factory=FanOut)
     plant: PlantOptions = field(default_factory=PlantOptions)
     samples: Count | None = None
     """Length of an episode, samples (default: the length of the case)."""
     episodes: Count = EPISODES
-    """Episodes to average a bound over, where plants or set points are drawn."""
+    """Number of episodes over which a bound is averaged, if plants or set points are random."""
     seed: Seed = SEED
     """Seed of the first episode."""
 
 
 def work(options: Options) -> str:
-    """Print the bounds of all cases and presets, or of another plant; return a note for users.
+    """Print a table of least possible mean errors, and return the closing text of the command.
 
-    After an error or an interruption, the cases that have finished are printed. With the option
-    `package`, the bounds that ship with the package are written instead.
+    The table has a row for each case, or for each case that has finished before an error or an
+    interruption. With the option `package`, the bounds that ship with the package are written
+    to a file, and no table is printed.
     """
     import pandas as pd
 
@@ -79,7 +102,10 @@ def work(options: Options) -> str:
     if options.package:
         return write_package(options.fan_out)
     tasks = {name: partial(row, case, options) for name, case in cases.items()}
-    print(", ".join(filter(None, ["Mean |e| in °C", options.plant.name])) + ":")
+    title = "Mean absolute error in °C"
+    if options.plant.name:
+        title += f", plant: {options.plant.name}"
+    print(f"{title}:")
     rows: dict[str, dict[str, str]] = {}
     try:
         rows.update(options.fan_out.stream(tasks, "bounds"))
@@ -87,14 +113,23 @@ def work(options: Options) -> str:
         if rows:
             table = pd.DataFrame([rows[name] for name in tasks if name in rows])
             print(on_screen(table), flush=True)
-    return "\n" + textwrap.fill(NOTE, shutil.get_terminal_size((150, 24)).columns)
+    return description()
+
+
+def description() -> str:
+    """Return a text that explains the columns of the table, broken to the terminal's width."""
+    width = shutil.get_terminal_size((150, 24)).columns
+    lines = ["", f"{INTERVALS} The columns of the table are:"]
+    for heading, meaning in COLUMNS.items():
+        text = f'- "{heading}": {meaning}'
+        lines.append(textwrap.fill(text, width, subsequent_indent="  "))
+    return "\n".join(lines)
 
 
 def row(case: Scenario, options: Options) -> dict[str, str]:
-    """Return the table's row for a case: its name and its errors, degC, as text.
+    """Return the cells of a case's row in the table: mean errors, degC, by column heading.
 
-    The keys are the headings of the table. The text is empty if the case has no bound of a
-    kind, or if it has no load for the estimate.
+    A cell is empty if the case has no bound of this kind, or no load that could be hidden.
     """
     from benchmarks.bounds.least import least_possible, with_hidden_load
     from benchmarks.controllers.roster import ROSTER
@@ -109,14 +144,15 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
         **case.arguments,
     }
     cells = {"case": case.name}
+    # The text of an estimate, such as `f"{estimate:.4f}"`, has the interval in parentheses.
     cells["idle valve"] = f"{least_possible(kind='preview', **arguments).idle:.4f}"
     for kind, heading in HEADINGS.items():
         cells[heading] = ""
         with suppress(NoBoundError):
             cells[heading] = f"{least_possible(kind=kind, **arguments):.4f}"
-    cells["hidden load (estimate)"] = ""
+    cells[HIDDEN_LOAD] = ""
     if case.parameters.is_disturbed:
-        cells["hidden load (estimate)"] = f"{with_hidden_load(**arguments):.4f}"
+        cells[HIDDEN_LOAD] = f"{with_hidden_load(**arguments):.4f}"
     if options.mpc:
         runs = ROSTER["mpc"].run(case.arguments, samples, options.mpc, options.seed)
         cells["MPC"] = f"{bootstrap(mean_error(runs), seed=0):.4f}"
@@ -124,33 +160,42 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
 
 
 def write_package(fan_out: FanOut) -> str:
-    """Write the least possible errors that ship with the package, `bounds.json`.
+    """Write the file of least possible errors that ships with the package `mptc_gym`.
 
-    Each case of `PACKAGED` has a list "least", the bounds of the episodes of published scores,
-    degC; the list has one number if all episodes have the same bound. If bounds differ between
-    episodes, the case also has a list "validation_least", the bounds of the episodes on which
-    policies are selected. `fan_out` runs the cases in parallel. The closing message of the
-    command is returned.
+    Each case of `PACKAGED` gets a list "least", the bounds of the episodes of a published
+    score, degC. The list has a single number if all episodes have the same bound. If the bounds
+    differ, the case gets a second list, "validation_least", the bounds of the episodes on which
+    policies are selected.
+
+    Parameters
+    ----------
+    fan_out
+        Runs the cases in parallel.
+
+    Returns
+    -------
+    str
+        The closing line of the command.
     """
     from benchmarks.bounds.least import least_possible
 
-    published: dict[str, Any] = {"seed": SEED, "episodes": EPISODES + MORE_EPISODES}
+    published: dict[str, Any] = {"seed": SEED, "episodes": PACKAGED_EPISODES}
     validation: dict[str, Any] = {"seed": VALIDATION_SEED, "episodes": VALIDATION_EPISODES}
     tasks = {
         name: partial(least_possible, samples=SAMPLES, **published, **arguments)
         for name, arguments in PACKAGED.items()
     }
     bounds = dict(fan_out.stream(tasks, "bounds"))
-    tasks = {
-        name: partial(least_possible, samples=SAMPLES, **validation, **PACKAGED[name])
-        for name, least in bounds.items()
-        if len(least.episodes) > 1
+    validation_tasks = {
+        name: partial(least_possible, samples=SAMPLES, **validation, **arguments)
+        for name, arguments in PACKAGED.items()
+        if len(bounds[name].episodes) > 1
     }
-    validation_bounds = dict(fan_out.stream(tasks, "validation bounds"))
+    validation_bounds = dict(fan_out.stream(validation_tasks, "validation bounds"))
     cases: dict[str, dict[str, Any]] = {}
     for name, arguments in PACKAGED.items():
-        least = bounds[name]
-        cases[name] = {"arguments": arguments, "kind": least.kind, "least": least.episodes}
+        bound = bounds[name]
+        cases[name] = {"arguments": arguments, "kind": bound.kind, "least": bound.episodes}
         if name in validation_bounds:
             cases[name]["validation_least"] = validation_bounds[name].episodes
     content = {
@@ -164,8 +209,8 @@ def write_package(fan_out: FanOut) -> str:
         "validation_episodes": VALIDATION_EPISODES,
         "cases": cases,
     }
-    write_json(PACKAGE, content)
-    return f"Written to {PACKAGE}"
+    write_json(PACKAGE_FILE, content)
+    return f"Written to {PACKAGE_FILE}"
 
 
 main = command("bounds", Options, work)

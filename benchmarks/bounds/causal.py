@@ -1,7 +1,7 @@
 """Penalise flows that use the future, to bound the cost of not knowing the next set point.
 
 With the environment's argument `setpoint="random"`, the set point is piecewise constant with a
-known distribution. Its *levels*, the values between changes, are independent and uniformly
+known distribution. The *levels*, the values between changes, are independent and uniformly
 distributed in [-A, A]. The number of samples for which a level lasts is uniformly distributed
 from S to L. The *age* of a level is the number of samples since the level began.
 
@@ -12,58 +12,61 @@ E[pi(j) | set points up to j] = 0, it follows that
     E[sum_j pi(j) u_a(j)] = 0.
 
 Hence the expected sum of errors |e(k)| of a controller without preview equals the expected sum
-of |e(k)| + pi(k) u_a(k). For fixed set points, the sum of |e(k)| + pi(k) u_a(k) is at least its
-minimum over all flows, even flows that use the future. So the mean over the set points of these
-minima is a lower bound (D. B. Brown, J. E. Smith and P. Sun, "Information relaxations and
-duality in stochastic dynamic programs", Operations Research 58, 2010, 785-801). Every pi gives
-a valid bound, but a poor choice of pi makes the bound loose. The choice of pi in this module is
+of |e(k)| + pi(k) u_a(k). For fixed set points, the sum of |e(k)| + pi(k) u_a(k) has a minimum
+over all flows, even flows that use the future. The mean of these minima over random set points
+is a lower bound for every controller without preview (D. B. Brown, J. E. Smith and P. Sun,
+"Information relaxations and duality in stochastic dynamic programs", Operations Research 58,
+2010, 785-801). Every pi gives a valid bound, but a poor choice of pi makes the bound loose. The
+choice of pi in this module is
 
     pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
 
-G[k, j] is the effect of the flow u_a(j) on the output y(k). The number g(k) is a guess of the
-slope of E|e(k)|, whose conditional means have a closed form. After a change of the set point, g
-is the sign of the change, until the output can have followed. At later ages of the level, g is
-a number between -1 and 1, odd in the level. It weighs staying at the present level against
-moving towards 0, where the next level is expected.
+G[k, j] is the effect of the flow u_a(j) on the output y(k). The *slope* g(k) is a rough
+estimate of how fast E|e(k)| rises with the expected error at k, in degC per degC. A formula
+gives the conditional means of g(k). After a change of the set point, g is the sign of the
+change until the output can have reached the new level. Then g is a number between -1 and 1,
+which weighs staying at the present level against moving towards 0, the mean of the next level.
 """
 
 import numpy as np
 import scipy  # loads its modules on first use
 from numpy.typing import NDArray
 
-from benchmarks.bounds.linear_program import Unknown, equations, response
+from benchmarks.bounds.linear_program import ErrorBounds, equations, response
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import held
 from mptc_gym.plant.signals import SetPointLevels
 
 Array = NDArray[np.float64]
 
-# Number of thresholds of the error, equally probable, that represent the noise in the guess g.
+# Number of thresholds of the error, equally probable, that represent the noise in the slope g.
 THRESHOLDS = 8
 # Largest steady-state gain, degC per t/h. It stands for the infinite gain of an integrating
 # plant, which can reach every temperature.
 LARGEST_GAIN = 1e9
-# If the flow's limits keep the output from reaching a set point, the output counts as having
-# followed after four time constants. This is the share of the way after four time constants.
-FOLLOWED = 1.0 - np.exp(-4.0)
-# Samples after which the impulse response of the plant is neglected in the guess g.
+SMALLEST_RANGE = 1e-9  # degC; least divisor, for set points and flows that are always 0
+# If the flow's limits keep the output from reaching a level, the output counts as having
+# arrived after four time constants. This is the share of the way after four time constants.
+ARRIVED = 1.0 - np.exp(-4.0)
+# Samples after which the impulse response of the plant is neglected in the slope g.
 HORIZON = 200
 
 
 class SetPointLaw:
     """The distribution of random set points on one plant, and the penalty for using the future.
 
-    The guess g in the penalty uses the plant's dynamics at the start of the episode.
+    The slope g in the penalty is computed for the plant's dynamics at the start of the episode.
 
     Parameters
     ----------
     model
         The plant, for all samples of an episode.
-    unknown
-        The lower bounds of E|m - n| for the same plant; they tell how large the noise is.
+    bounds
+        The lower bounds of the mean errors for this plant, from which the size of the noise
+        follows.
     """
 
-    def __init__(self, model: LinearModel, unknown: Unknown) -> None:
+    def __init__(self, model: LinearModel, bounds: ErrorBounds) -> None:
         samples = len(model.load)
         parameters = model.parameters
         at_start = LinearModel(parameters, model.numbers, 0)
@@ -73,13 +76,13 @@ class SetPointLaw:
         self._amplitude = levels.amplitude
         self._shortest = levels.shortest
         self._longest = levels.longest
-        # The largest temperature, degC, that a constant flow can keep on both sides of 0.
+        # A constant flow can keep every temperature from -reachable to reachable, degC.
         low, high = model.limits
         gain = min(float(np.abs(at_start.gain)), LARGEST_GAIN)
-        self._reach = gain * min(-low, high)
-        # Noise blurs the sign of a small error. Equally probable thresholds of the error, degC,
-        # represent it: quantiles of the magnitude of a normal number.
-        deviation = unknown.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
+        self._reachable = gain * min(-low, high)
+        # Noise makes the sign of a small error uncertain. Equally probable thresholds of the
+        # error, degC, represent the noise: quantiles of the magnitude of a normal number.
+        deviation = bounds.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
         shares = (np.arange(THRESHOLDS) + 0.5) / THRESHOLDS
         self._thresholds = np.zeros(1)
         if deviation > 0.0:
@@ -88,14 +91,15 @@ class SetPointLaw:
         # output approaches the farthest temperature that the limits allow. `_progress` is the
         # share of this way that the output has made, by the age of the level.
         age = np.arange(samples)
-        slowest_pole = np.abs(np.roots([1.0, *-at_start.alpha])).max(initial=0.0)
-        self._progress = 1.0 - slowest_pole ** np.maximum(age - model.lag + 1, 0)
-        # The age from which on the output has followed the largest change within reach.
-        largest_share = 2.0 * self._amplitude / max(self._reach + self._amplitude, 1e-9)
-        self._settled = int(np.searchsorted(self._progress, min(largest_share, FOLLOWED)))
+        self._progress = 1.0 - at_start.slowest_pole ** np.maximum(age - model.lag + 1, 0)
+        # From this age on, the output has arrived at the new level after any change. The
+        # largest change within reach is from -amplitude to amplitude.
+        largest_way = max(self._reachable + self._amplitude, SMALLEST_RANGE)
+        largest_share = 2.0 * self._amplitude / largest_way
+        self._arrival_age = int(np.searchsorted(self._progress, min(largest_share, ARRIVED)))
         # The probability that a level lasts beyond an age, by age.
         lengths = self._longest - self._shortest + 1
-        self._still_held = np.clip((self._longest - age) / lengths, 0.0, 1.0)
+        self._probability_held = np.clip((self._longest - age) / lengths, 0.0, 1.0)
         # The response to an impulse of 1 t/h of flow, degC, by the number of samples since the
         # first sample at which the output reacts.
         zeros = model.lag - int(model.numbers.delay) - 1  # leading zeros of B
@@ -107,44 +111,44 @@ class SetPointLaw:
         `setpoint` holds the set points y_d(k) of one episode, degC, shape (samples,).
         """
         samples = len(setpoint)
-        holds = held(setpoint)
-        level_before = 0.0
-        guess = np.zeros(samples)  # g(k)
-        guesses_of_holds = []
-        for start, end in holds:
+        slope = np.zeros(samples)  # g(k)
+        expected = np.zeros((samples, samples))  # [k, j]: E[g(k) | set points up to j]
+        previous_level = 0.0  # before the episode
+        for start, end in held(setpoint):
             level = setpoint[start]
-            # The mean of what a change at the end of this level adds to g, as a cumulative sum
-            # over the samples after the change. Zeros stand for the time before the change.
-            summed = np.cumsum(self._mean_slope(level) * self._still_held)
-            added = np.append(np.zeros(self._longest + 1), summed)
-            stay = self._slope(level_before, level) + self._lean(added)
-            guess[start:end] = stay[: end - start]
-            guesses_of_holds.append((stay, added))
-            level_before = level
-        surprise = np.zeros((samples, samples))  # [k, j]: g(k) - E[g(k) | set points up to j]
-        for (start, end), (stay, added) in zip(holds, guesses_of_holds, strict=True):
+            change_sums = self._sums_after_next_change(level)
+            slope_if_held = self._slope_after_change(previous_level, level)
+            slope_if_held += self._slope_after_arrival(change_sums)
+            slope[start:end] = slope_if_held[: end - start]
             for j in range(start, end):
-                ages = np.arange(j + 1 - start, samples - start)
-                expected = self._expected(ages, j - start, stay, added)
-                surprise[j + 1 :, j] = guess[j + 1 :] - expected
+                later_ages = np.arange(j + 1 - start, samples - start)
+                expected[j + 1 :, j] = self._expected_slope(
+                    later_ages, j - start, slope_if_held, change_sums
+                )
+            previous_level = level
+        # Only slopes after j are unexpected at j.
+        surprise = np.tril(slope[:, np.newaxis] - expected, k=-1)
         return np.asarray(np.einsum("kj,kj->j", self._flow_response, surprise))
 
-    def _expected(
-        self, ages: NDArray[np.intp], known_age: int, stay: Array, added: Array
+    def _expected_slope(
+        self,
+        ages: NDArray[np.intp],
+        known_age: int,
+        slope_if_held: Array,
+        change_sums: Array,
     ) -> Array:
-        """Return the expected guess g at later ages of a level that lasts at the present age.
+        """Return the conditional means of the slope g, given that a level has reached an age.
 
         Parameters
         ----------
         ages
-            Ages of the level at which g is wanted, samples, all later than `known_age`.
+            Ages of the level at which g is wanted, samples, all above `known_age`.
         known_age
-            The present age of the level, samples: the level has not changed up to this age.
-        stay
-            The guess g by age if the level never changes, shape (samples,).
-        added
-            The mean of what a change of the level adds to g, as a cumulative sum over samples,
-            from `longest + 1` samples before the change on.
+            Age up to which the level is known not to change, samples.
+        slope_if_held
+            The slope g by age if the level never changes, shape (samples,).
+        change_sums
+            What `_sums_after_next_change` returns for the level.
 
         Returns
         -------
@@ -154,56 +158,72 @@ class SetPointLaw:
         # The next level begins at an age from `first` to `longest`, all equally probable.
         first = max(self._shortest, known_age + 1)
         count = self._longest - first + 1
-        changed = np.clip((ages - first + 1) / count, 0.0, 1.0)
-        # After a second change g is as often positive as negative, as levels are symmetric.
-        expected: Array = (1.0 - changed) * stay[ages]
-        expected += (added[ages + count] - added[ages]) / count
+        change_probability = np.clip((ages - first + 1) / count, 0.0, 1.0)
+        expected: Array = (1.0 - change_probability) * slope_if_held[ages]
+        expected += (change_sums[ages + count] - change_sums[ages]) / count
         return expected
 
-    def _slope(self, before: float, after: float) -> Array:
-        """Return the guess g after a change of the set point, by age, shape (samples,).
+    def _slope_after_change(self, previous_level: float, level: float) -> Array:
+        """Return the slope g after a change of the set point, by age, shape (samples,).
 
-        The set point changes from `before` to `after`, degC. From the age at which the output
-        can have followed the change, the returned g is 0.
+        The set point changes from `previous_level` to `level`, degC. The slope is the sign of
+        the change times the probability that the error is larger than the noise. The slope is 0
+        after the output has arrived at the new level.
         """
-        change = after - before
-        room = max(self._reach - np.sign(change) * before, 0.0)
-        remaining = np.abs(change) - room * self._progress[:, np.newaxis]
+        change = level - previous_level
+        way = max(self._reachable - np.sign(change) * previous_level, 0.0)
+        remaining = np.abs(change) - way * self._progress[:, np.newaxis]
         slope: Array = np.sign(change) * (remaining > self._thresholds).mean(axis=1)
-        slope[self._settled :] = 0.0
+        slope[self._arrival_age :] = 0.0
         return slope
 
-    def _mean_slope(self, before: float) -> Array:
-        """Return the mean of `_slope` over all possible next levels, by age, shape (samples,).
+    def _mean_slope_after_change(self, level: float) -> Array:
+        """Return the mean of `_slope_after_change` over all next levels, shape (samples,).
 
-        `before` is the level before the change, degC.
+        The set point changes from `level`, degC, to a next level that is uniformly distributed.
+        Element i is the mean slope at the age i of the next level.
         """
         A = self._amplitude
         progress = self._progress[:, np.newaxis]
-        upwards = A - before - max(self._reach - before, 0.0) * progress - self._thresholds
-        downwards = A + before - max(self._reach + before, 0.0) * progress - self._thresholds
-        difference = np.maximum(upwards, 0.0) - np.maximum(downwards, 0.0)
-        mean: Array = difference.mean(axis=1) / (2.0 * A)
-        mean[self._settled :] = 0.0
+        way_up = max(self._reachable - level, 0.0)
+        way_down = max(self._reachable + level, 0.0)
+        # Lengths of the intervals of next levels that the output has not reached.
+        above = np.maximum(A - level - way_up * progress - self._thresholds, 0.0)
+        below = np.maximum(A + level - way_down * progress - self._thresholds, 0.0)
+        mean: Array = (above - below).mean(axis=1) / (2.0 * A)
+        mean[self._arrival_age :] = 0.0
         return mean
 
-    def _lean(self, added: Array) -> Array:
-        """Return the guess g at ages when the output has followed, by age, shape (samples,).
+    def _sums_after_next_change(self, level: float) -> Array:
+        """Return cumulative sums of the mean slope g after the next change from `level`, degC.
 
-        The guess is such that an additional flow at any of these ages changes the expected
-        error by nothing: the sum over later ages of the impulse response times the mean of g is
-        0. The equations are solved from the highest age of a set point, the number of samples
-        since it changed, down to the lowest. `added` is defined as in `_expected`.
+        The element `longest + 1 + i` is the sum over the samples from the change to i samples
+        after the change. The first `longest + 1` elements, for samples before the change, are
+        0.
         """
-        samples = len(self._still_held)
-        lean = np.zeros(samples)
-        if not self._impulse[0]:
-            return lean
-        for age in range(min(self._longest, samples) - 1, self._settled - 1, -1):
+        # After a second change, the mean slope is 0, as levels are symmetric around 0.
+        mean_slope = self._mean_slope_after_change(level) * self._probability_held
+        return np.append(np.zeros(self._longest + 1), np.cumsum(mean_slope))
+
+    def _slope_after_arrival(self, change_sums: Array) -> Array:
+        """Return the slope g at ages after the output's arrival, by age, shape (samples,).
+
+        The slopes solve one equation for each age: an additional flow that acts from this age
+        on does not change the expected error. So the sum over later ages of the impulse
+        response times the mean of g is 0. The highest age comes first. `change_sums` is what
+        `_sums_after_next_change` returns.
+        """
+        samples = len(self._probability_held)
+        slope = np.zeros(samples)
+        if not self._impulse[0]:  # No flow has an effect.
+            return slope
+        for age in range(min(self._longest, samples) - 1, self._arrival_age - 1, -1):
             known_age = age - self._lag  # when the flow is chosen
             ages = np.arange(age, min(samples, age + HORIZON))
-            worth = self._impulse[: len(ages)] @ self._expected(ages, known_age, lean, added)
+            expected = self._expected_slope(ages, known_age, slope, change_sums)
+            effect_of_flow = self._impulse[: len(ages)] @ expected
             count = self._longest - max(self._shortest, known_age + 1) + 1
-            held_at_age = min(1.0, (self._longest - age) / count)  # probability
-            lean[age] = np.clip(-worth / (self._impulse[0] * held_at_age), -1.0, 1.0)
-        return lean
+            held_probability = min(1.0, (self._longest - age) / count)
+            solution = -effect_of_flow / (self._impulse[0] * held_probability)
+            slope[age] = np.clip(solution, -1.0, 1.0)
+        return slope

@@ -1,101 +1,76 @@
-"""Estimate how much the least possible error grows as no controller can measure the load.
+"""Estimate how much the least possible error grows because no controller measures the load.
 
-The bounds of `least.py` assume that the load disturbance is known up to the sample k - d - 1,
-where d is the plant's delay. A real controller has only the transmitter's readings, in which
-noise hides the load. No lower bound is known for controllers with readings alone, so their
-least possible error is estimated. Reports show the estimate as "hidden load" beside the bound.
+The bounds of `least.py` assume that the load is known up to the sample k - d - 1, where d is
+the plant's delay. A real controller has only the transmitter's readings, in which noise hides
+the load. No lower bound is known for controllers that have only readings, so this module
+estimates their least possible error. Reports show the estimate as "hidden load".
 
-The estimate replaces the load by a normal process with the same variances and correlations.
-Then the unknown part of the output y(k) is normal, with a variance that a Kalman filter gives,
-and the least possible error follows as in `linear_program.py`. The least possible error is
-computed for a normal load that is known up to k - d - 1, and for readings alone. The difference
-of the two errors is added to the bound. Both errors are too large for a load that jumps, which
-is zero most of the time and large otherwise; most of this excess cancels in the difference.
+The estimate is the bound plus the increase of the least possible error from a known load to a
+hidden load, for a load that is normally distributed with the variances and correlations of the
+real load. With a normal load, the unknown part of the output y(k) is normal, and a Kalman
+filter gives the variance of this part. A load that jumps causes smaller errors than a normal
+load with the same variance, but most of this difference cancels when the two least possible
+errors are subtracted.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.bounds.linear_program import Unknown
-from benchmarks.bounds.unknown import (
+from benchmarks.bounds.linear_program import ErrorBounds
+from benchmarks.bounds.prediction import (
     filtered_covariance,
-    noise_system,
+    noise_covariance,
     predicted_variance,
-    unknown_of_normal,
 )
-from benchmarks.loop.linear import LinearModel
+from benchmarks.bounds.unknown import bounds_for_normal
+from benchmarks.loop.linear import LOAD_STEPS, LinearModel
 from mptc_gym.plant.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
-# Places of the two parts of the load, the piecewise constant part and the random walk, in the
-# state vector.
-STEPS, WALK = -2, -1
 
+def bounds_with_known_load(model: LinearModel) -> ErrorBounds:
+    """Return the lower bounds of the mean errors at k for a load that is known up to k - d - 1.
 
-def unknown_of_normal_load(model: LinearModel) -> Unknown:
-    """Return the bounds of E|m(k) - n(k)| for a normal load that is known up to k - d - 1.
-
-    Here d is the plant's delay, n(k) the part of the output that is unknown at k - d - 1, and
-    m(k) the error without n(k). `model` is the plant, for the samples of an episode.
+    Here d is the plant's delay, and the load is taken to be normal. `model` is the plant, for
+    the samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)
-    filtered = np.zeros_like(F)  # a known load has no variance
-    if model.numbers.measurement_noise_variance > 0.0:
-        filtered[:, :STEPS, :STEPS] = filtered_covariance(
-            *noise_system(model), model.numbers.measurement_noise_variance
-        )
-    return unknown_of_normal(predicted_variance(filtered, F, Q, model.lag))
+    filtered = np.zeros_like(F)  # A known load has no variance.
+    filtered[:, :LOAD_STEPS, :LOAD_STEPS] = noise_covariance(model)
+    return bounds_for_normal(predicted_variance(filtered, F, Q, model.lag))
 
 
-def unknown_of_hidden_load(model: LinearModel) -> Unknown:
-    """Return the bounds of E|m(k) - n(k)| for a normal load and a controller with readings.
+def bounds_with_hidden_load(model: LinearModel) -> ErrorBounds:
+    """Return the lower bounds of the mean errors at k for readings up to k - d - 1 alone.
 
-    Only the transmitter's readings up to k - d - 1 are known, where d is the plant's delay.
-    Here n(k) is the part of the output that is then unknown, and m(k) the error without n(k).
-    `model` is the plant, for the samples of an episode.
+    Here d is the plant's delay, and the load is unknown and taken to be normal. `model` is the
+    plant, for the samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)
     filtered = filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
-    return unknown_of_normal(predicted_variance(filtered, F, Q, model.lag))
+    return bounds_for_normal(predicted_variance(filtered, F, Q, model.lag))
 
 
 def _with_load(model: LinearModel) -> tuple[Array, Array]:
-    """Return F(k) and Q(k) of a state-space form of the plant with its load disturbance.
+    """Return F(k) and Q(k) of x(k) = F(k) x(k-1) + v(k) for a plant with a normal load.
 
-    The state is x(k) = F(k) x(k-1) + v(k), where v(k) is white with the covariance Q(k). The
-    first elements of x(k) are a state of equation (28) of the paper, the output first. The last
-    two elements are the piecewise constant part and the random walk of the load, degC, whose
-    sum is the load. F and Q have the shape (samples, size, size), for the samples of `model`.
+    The state x(k) is the state of `LinearModel.state_space_with_load`, and v(k) is white with
+    the covariance Q(k). F and Q have the shape (samples, size, size).
     """
     numbers = model.numbers
-    F_noise, Q_noise = noise_system(model)
-    samples = len(F_noise)
-    size = F_noise.shape[-1] + 2
-    k = np.arange(samples)
+    k = np.arange(len(model.load))
     is_change = (k % LOAD_INTERVAL == 0) & (k > 0)
-    jump = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval)  # probability
+    jump_probability = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval)
     # The mean of the piecewise constant part at k, as a share of its value at k - 1.
-    stays = np.where(is_change, 1.0 - jump, 1.0)
-
-    F = np.zeros((samples, size, size))
-    F[:, :STEPS, :STEPS] = F_noise
-    F[:, STEPS, STEPS] = stays
-    F[:, WALK, WALK] = 1.0
-    F[:, 0, STEPS] = model.load * stays
-    F[:, 0, WALK] = model.load
-
+    stays = np.where(is_change, 1.0 - jump_probability, 1.0)
     # The piecewise constant part is 0 until its first jump, and uniformly distributed after it.
-    has_jumped = 1.0 - np.cumprod(stays)  # probability
-    level_variance = has_jumped * numbers.disturbance_amplitude**2 / 3.0
-    variance_before = np.append(0.0, level_variance[:-1])
-    step_variance = level_variance - np.square(stays) * variance_before
+    probability_of_jump_before = 1.0 - np.cumprod(stays)
+    level_variance = probability_of_jump_before * numbers.disturbance_amplitude**2 / 3.0
+    previous_variance = np.append(0.0, level_variance[:-1])
+    step_variance = level_variance - np.square(stays) * previous_variance
     walk_variance = is_change * LOAD_INTERVAL * numbers.disturbance_walk_variance
-    Q = np.zeros((samples, size, size))
-    Q[:, :STEPS, :STEPS] = Q_noise
-    for part, variance in ((STEPS, step_variance), (WALK, walk_variance)):
-        enters = np.zeros((samples, size))  # how a change of this part enters the state
-        enters[:, 0] = model.load
-        enters[:, part] = 1.0
-        Q += variance[:, np.newaxis, np.newaxis] * np.einsum("ki,kj->kij", enters, enters)
-    return F, Q
+    noise_variance = np.full(len(k), numbers.noise_variance)
+    variances = np.stack([noise_variance, step_variance, walk_variance], axis=1)
+    F, E = model.state_space_with_load(stays)
+    return F, np.einsum("kv,kiv,kjv->kij", variances, E, E)

@@ -1,10 +1,11 @@
-"""Compute the least possible mean error of any case of the environment, and scores from it.
+"""Compute the least possible mean error of a case of the environment, and scores.
 
 The mean error is the mean of |e(k)| over the samples k = 1 to N of an episode, where e(k) is
 the set point minus the output, degC. The file README.md says for which controllers each kind of
-bound holds. A controller at k may know the transmitter's readings, the set points, the plant's
-parameters and the loads up to k, but neither the true output, `info["output"]`, nor the time of
-the load's next jump. The controller may compensate the dead zone.
+bound holds. At sample k, a controller may know the plant's parameters, and the transmitter's
+readings, the set points and the loads up to k. A controller knows neither the true output,
+`info["output"]`, nor the time of the load's next jump. A controller may compensate the dead
+zone.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,9 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.bounds.causal import SetPointLaw
-from benchmarks.bounds.hidden import unknown_of_hidden_load, unknown_of_normal_load
-from benchmarks.bounds.linear_program import TAIL, TRAVEL_PRICE, Unknown, plan, reference
-from benchmarks.bounds.unknown import unknown
+from benchmarks.bounds.hidden import bounds_with_hidden_load, bounds_with_known_load
+from benchmarks.bounds.linear_program import (
+    LOOKAHEAD,
+    TRAVEL_PRICE,
+    ErrorBounds,
+    plan,
+    reference,
+)
+from benchmarks.bounds.unknown import error_bounds
 from benchmarks.lib.errors import NoBoundError
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.loop.linear import LinearModel
@@ -47,22 +54,33 @@ KINDS = "preview", "causal", "reference"
 class LeastPossible(Estimate):
     """The least possible mean |e| of a case, degC, with a 95 % interval over random episodes.
 
-    If the bound is the same for all episodes, both ends of the interval equal `value`.
+    If the least error is the same in all episodes, `low` and `high` equal `value`.
     """
 
     kind: str  # one of `KINDS`
     idle: Estimate  # mean |e| of the same episodes with an idle valve, degC
-    # The bounds of the episodes, degC, of which `value` is the mean: number i belongs to the
-    # episode with the seed `seed + i`. For the kind "causal" only the mean is a bound. There is
-    # one number if the bound is the same for all episodes.
+    # The least errors of the episodes with the seeds `seed + i`, degC; `value` is their mean.
+    # There is a single number if the least error is the same in all episodes. For the kind
+    # "causal", the mean is a bound, but the numbers of single episodes are not.
     episodes: tuple[float, ...]
 
     def score(self, errors: ArrayLike) -> Array:
         """Return scores: 0 for the error of an idle valve, 1 for the least possible error.
 
-        `errors` are mean errors of controllers, degC, of any shape; the scores have the same
-        shape. The score of a single run may exceed 1 by chance. A ValueError is raised if the
-        least possible error is not below that of an idle valve.
+        Parameters
+        ----------
+        errors
+            Mean errors of controllers, degC, of any shape.
+
+        Returns
+        -------
+        ndarray
+            Scores, in the shape of `errors`. The score of a single run may exceed 1 by chance.
+
+        Raises
+        ------
+        ValueError
+            If the least possible error is not below the error of an idle valve.
         """
         idle = self.idle.value
         if idle - self.value <= 1e-9 * max(idle, 1.0):
@@ -86,14 +104,15 @@ def least_possible(
     samples
         N, the length of an episode.
     kind
-        One of `KINDS`. With None, the kind is that of reports and of `mptc_gym.evaluate`:
-        "causal" for random set points; otherwise "reference", or "preview" if the case has no
-        reference or if the set point never changes.
+        One of `KINDS`. With None, as in reports and in `mptc_gym.evaluate`, the kind is
+        "causal" for random set points, "preview" for constant set points, and otherwise
+        "reference", or "preview" if the case has no reference.
     episodes
-        Number of episodes over which the bound is averaged, if it differs between episodes.
+        Number of episodes over which the least error is averaged, if plants or set points are
+        random.
     seed
         Seed of the first episode: episode i is the environment's episode with the seed
-        `seed + i`. By default, the episodes are those of `mptc_gym.evaluate`.
+        `seed + i`.
     **arguments
         Arguments of the environment, which define the case.
 
@@ -103,7 +122,7 @@ def least_possible(
         If the case has no bound of this kind: "causal" needs random set points, and "reference"
         needs set points that do not change before the plant has settled.
     ValueError
-        If an argument is out of its range.
+        If `samples`, `episodes`, `kind` or an argument of the environment is not allowed.
     """
     parameters = Parameters(**arguments)
     for name, count in (("samples", samples), ("episodes", episodes)):
@@ -111,23 +130,23 @@ def least_possible(
             raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
     if kind is not None and kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
-    has_law = parameters.setpoint == "random"
-    if kind == "causal" and not has_law:
+    has_random_setpoint = parameters.setpoint == "random"
+    if kind == "causal" and not has_random_setpoint:
         raise NoBoundError(
-            f"kind must be preview or reference, as the set point {parameters.setpoint!r} has "
-            f"no law, got {kind!r}"
+            f"kind must be preview or reference, as the set point {parameters.setpoint!r} is "
+            f"not random, got {kind!r}"
         )
     case = parameters, samples, episodes, seed
     if kind is not None:
         return _bound(*case, kind)
-    if has_law:
+    if has_random_setpoint:
         return _bound(*case, "causal")
-    (setpoint,) = _draw(parameters, samples, 1, seed).setpoints
+    setpoint = _draw(parameters, samples, 1, seed).setpoints[0]
     if np.ptp(setpoint) == 0.0:  # Without a change, foresight makes no difference.
         return _bound(*case, "preview")
     try:
         return _bound(*case, "reference")
-    except NoBoundError:  # the plant does not settle between changes
+    except NoBoundError:  # The plant does not settle between changes.
         return _bound(*case, "preview")
 
 
@@ -139,10 +158,10 @@ def with_hidden_load(
     seed: int = SEED,
     **arguments: Any,
 ) -> Estimate:
-    """Estimate the least possible mean |e(k)| if the load cannot be measured, degC.
+    """Return an estimate of the least possible mean |e(k)| if nobody measures the load, degC.
 
-    The estimate is not a bound: see `hidden.py`. For a case without a load, the bound is
-    returned. The arguments and the errors are those of `least_possible`.
+    The estimate is not a bound: see `hidden.py`. For a case without a load, the result is the
+    least possible error. `least_possible` describes the parameters and exceptions.
     """
     least = least_possible(
         samples=samples, kind=kind, episodes=episodes, seed=seed, **arguments
@@ -154,8 +173,8 @@ def with_hidden_load(
     estimates = []
     for i, bound in enumerate(least.episodes):
         episode = parameters, least.kind, drawn.numbers[i], drawn.setpoints[i]
-        hidden_load = _error_sum(*episode, unknown_of_hidden_load)
-        known_load = _error_sum(*episode, unknown_of_normal_load)
+        hidden_load = _error_sum(*episode, bounds_with_hidden_load)
+        known_load = _error_sum(*episode, bounds_with_known_load)
         estimates.append(bound + (hidden_load - known_load) / samples)
     return student(estimates)
 
@@ -170,19 +189,7 @@ class _Episodes(NamedTuple):
 
 
 def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
-    """Return the episodes that the environment makes for some seeds.
-
-    Parameters
-    ----------
-    parameters
-        The arguments of the environment.
-    samples
-        N, the length of an episode.
-    episodes
-        Number of episodes.
-    seed
-        Episode i has the seed `seed + i`.
-    """
+    """Return the environment's episodes with the seeds `seed`, `seed + 1` and so on."""
     numbers = drawn_numbers(parameters, episodes, seed)
     with closing(make_plants(episodes, samples + 1, **asdict(parameters))) as plants:
         idle_valve = IdleValve(numbers.u_min, numbers.u_max)
@@ -198,14 +205,18 @@ def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Ep
 def _bound(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
-    """Return the bound of one of `KINDS`; the arguments are those of `least_possible`."""
+    """Return the least possible error for one of `KINDS`; a NoBoundError is raised without one.
+
+    `least_possible` describes the parameters.
+    """
     if not is_random(parameters):
         episodes = 1
     drawn = _draw(parameters, samples, episodes, seed)
+    bounds = episodes
     if not (parameters.ranges or parameters.setpoint == "random"):
-        episodes = 1  # Noise and load do not change the bound.
+        bounds = 1  # Noise and load do not change the bound.
     values = []
-    for i in range(episodes):
+    for i in range(bounds):
         error_sum = _error_sum(parameters, kind, drawn.numbers[i], drawn.setpoints[i])
         # Rounded to be the same on all machines, as solvers differ in later digits.
         values.append(round(error_sum / samples, 6))
@@ -218,14 +229,13 @@ def _error_sum(
     kind: str,
     numbers: PlantNumbers[float],
     setpoint: Array,
-    unknown_of: Callable[[LinearModel], Unknown] = unknown,
+    bounds_of: Callable[[LinearModel], ErrorBounds] = error_bounds,
 ) -> float:
-    """Return one episode's bound on the sum of |e(k)| over k = 1 to N, degC.
+    """Return the least possible sum of |e(k)| over k = 1 to N in one episode, degC.
 
-    The sum of the lower bounds of E|e(k)| is returned. For the kind "causal", the penalty of
-    the flows is added, and only the mean over episodes is a bound. For the kind "reference",
-    the small price of valve travel is added, as different solvers agree on the sum of errors
-    and price only.
+    For the kind "causal", the sum contains the penalty for flows that use the future, and only
+    the mean over many episodes is a bound. For the kind "reference", the sum contains a small
+    price of valve travel: solvers agree on the sum with the price, but not without it.
 
     Parameters
     ----------
@@ -237,22 +247,21 @@ def _error_sum(
         The plant numbers of the episode.
     setpoint
         Set points y_d(k) for k = 0 to N, degC, shape (N + 1,).
-    unknown_of
-        Function that returns the lower bounds of E|m(k) - n(k)| for a plant, where n(k) is what
-        no flow can counteract in time, and m(k) the error without n(k).
+    bounds_of
+        A function that returns the lower bounds of the mean errors for a plant.
     """
-    k = np.arange(len(setpoint))
-    if kind == "reference":  # which looks beyond the end of the episode
-        k = np.arange(len(setpoint) + int(numbers.delay) + len(parameters.b) + TAIL)
-    model = LinearModel(parameters, numbers, k)
-    unforeseen = unknown_of(model)
+    length = len(setpoint)
+    if kind == "reference":  # A reference looks beyond the end of the episode.
+        length += int(numbers.delay) + len(parameters.b) + LOOKAHEAD
+    model = LinearModel(parameters, numbers, np.arange(length))
+    bounds = bounds_of(model)
     if kind == "reference":
-        errors, flow = reference(model, unforeseen, setpoint)
+        errors, flow = reference(model, bounds, setpoint)
         costs = TRAVEL_PRICE * np.abs(np.diff(flow, prepend=0.0))
     else:
         penalty = np.zeros(len(setpoint))
         if kind == "causal" and parameters.setpoint_amplitude > 0.0:
-            penalty = SetPointLaw(model, unforeseen).penalty(setpoint)
-        errors, flow = plan(model, unforeseen, setpoint, penalty=penalty)
+            penalty = SetPointLaw(model, bounds).penalty(setpoint)
+        errors, flow = plan(model, bounds, setpoint, penalty=penalty)
         costs = penalty * flow
-    return float(errors[1:].sum() + costs.sum())  # no flow changes e(0)
+    return float(errors[1:].sum() + costs.sum())  # without e(0), which no flow changes

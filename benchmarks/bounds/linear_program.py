@@ -24,10 +24,10 @@ TIME_LIMIT = 30.0  # s for each attempt; most programs take less than 1 s
 
 # A plant counts as settled if the flow stays within this fraction of the actuator's range for
 # the lag of the plant, the time from a flow to its first effect.
-SETTLED = 0.05
+SETTLED_FLOW_RANGE = 0.05
 # Samples by which the plan of a reference looks beyond a change of the set point, in addition
 # to the lag. With more samples the references of the presets are the same.
-TAIL = 60
+LOOKAHEAD = 60
 # Two small prices that select among plans with equal errors; the price of an error is 1. With
 # `SMALLEST_SLOPE`, degC for each degC, a plan ends at the set point. With `TRAVEL_PRICE`, degC
 # for each t/h of valve travel, the valve moves no more than needed.
@@ -36,32 +36,33 @@ TRAVEL_PRICE = 1e-4
 
 
 @dataclass(frozen=True)
-class Unknown:
-    """Lower bounds of E|m - n| at each sample: the highest of lines in |m|.
+class ErrorBounds:
+    """Lower bounds of the mean absolute error E|e| at each sample, as functions of |E[e]|.
 
-    Here n is the part of the output, degC, that no flow can counteract in time, and m the error
-    without n; see `unknown.py`. A line is intercept + slope * |m|.
+    A bound is the highest of several lines, intercept + slope * |E[e]|; see `unknown.py`.
     """
 
-    # The slopes of the lines, ascending from 0 to 1, shape (slopes,). If nothing is unknown, n
-    # is 0, and the only slope is 1.
+    # The slopes of the lines, ascending from 0 to 1, shape (slopes,). If neither noise nor load
+    # is random, the only slope is 1.
     slopes: Array
     intercepts: Array  # of the lines at each sample, degC, shape (samples, slopes)
 
-    def mean_error(self, m: Array) -> Array:
-        """Return the lower bounds of E|m(k) - n(k)| for expected errors m(k).
+    def mean_error(self, expected_errors: Array) -> Array:
+        """Return the lower bounds of the mean absolute errors E|e|, degC, shape (count,).
 
-        `m` holds the expected errors of the first samples, degC, shape (count,), and the bounds
-        have the same unit and shape.
+        `expected_errors` holds the expected errors E[e] of the first samples, degC, shape
+        (count,).
         """
-        lines = self.intercepts[: len(m)] + self.slopes * np.abs(m)[:, np.newaxis]
+        magnitudes = np.abs(expected_errors)[:, np.newaxis]
+        lines = self.intercepts[: len(expected_errors)] + self.slopes * magnitudes
         return np.asarray(lines.max(axis=1))
 
     @property
     def lengths(self) -> Array:
-        """Lengths of the intervals of |m| on which each line is the highest line, degC.
+        """For each line, the length of the interval on which the line is the highest, degC.
 
-        The shape is (samples, slopes). The interval of the last line is infinitely long.
+        The intervals divide the magnitudes of the expected error from 0 to infinity. The
+        interval of the last line is infinitely long. The shape is (samples, slopes).
         """
         ends = np.full(self.intercepts.shape, np.inf)
         corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
@@ -70,12 +71,11 @@ class Unknown:
 
 
 def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
-    """Return the matrices A and B of A y = B u for the plant without noise and load.
+    """Return the matrices A and B of A y = B u, the plant without noise and load.
 
-    The vectors y and u hold the outputs, degC, and the flows, t/h, of an episode from rest. The
-    matrix equation is equation (28) of the paper for all samples of an episode. `model` is the
-    plant, and `samples` the length of the episode. Both matrices are sparse and have the shape
-    (samples, samples).
+    The vectors y and u hold the outputs, degC, and the applied flows, t/h, of all `samples` of
+    an episode from rest. The matrix equation is equation (28) of the paper. Both matrices are
+    sparse and have the shape (samples, samples).
     """
     past_outputs = _lagged(model.alpha[:samples], 1)
     past_flows = _lagged(model.beta[:samples], int(model.numbers.delay) + 1)
@@ -95,13 +95,13 @@ def _lagged(coefficients: Array, lag: int) -> Any:
 def response(A: Any, B: Any) -> Array:
     """Return G, which solves A G = B: a flow of 1 t/h at sample j adds G[k, j] degC to y(k).
 
-    `A` and `B` are what `equations` returns, of shape (samples, samples), as is G.
+    `A` and `B` are the sparse matrices of `equations`. G has the shape (samples, samples).
     """
     return np.asarray(scipy.linalg.solve_triangular(A.toarray(), B.toarray(), lower=True))
 
 
 class Plan(NamedTuple):
-    """The mean flow for which the sum of the bounds of E|e(k)| is least, and these bounds."""
+    """Mean flows of an episode, and the bounds of the mean errors that the flows cause."""
 
     errors: Array  # lower bounds of E|e(k)|, degC, shape (samples,)
     flow: Array  # the mean of u_a(k), t/h, shape (samples,)
@@ -109,24 +109,26 @@ class Plan(NamedTuple):
 
 def plan(
     model: LinearModel,
-    unknown: Unknown,
+    bounds: ErrorBounds,
     setpoint: Array,
     *,
     past: ArrayLike = (),
     quiet: bool = False,
     penalty: ArrayLike = 0.0,
 ) -> Plan:
-    """Return the mean flow for which the sum of the bounds of E|e(k)| is least.
+    """Return the mean flow for which the sum of the bounds of the errors is least.
 
-    The minimum is a lower bound for every controller, causal or not. To see this, let y and u_a
-    be the means of output and flow over all noise, load and randomness of the controller. As
-    equation (28) of the paper is linear, these means satisfy equation (28) without noise. As
-    the flow always lies within the limits, so does its mean. As E|m - n| is convex in the error
-    m without the unknown effects n, its mean over everything that may be known is at least its
-    value at the mean of m, which is y_d - y, the set point minus the mean output (Jensen's
-    inequality). So the controller's mean error is at least the minimum over all mean flows
-    within the limits. The minimum is a linear program, as each bound of E|m - n| is a maximum
-    of lines.
+    The least sum is a lower bound for every controller, even for a controller that knows the
+    future. The proof uses y and u, the means of output and applied flow over all noise, loads
+    and random decisions of a controller:
+
+    - Equation (28) of the paper is linear, so y and u satisfy equation (28) without noise.
+    - The flow always lies within the limits of the actuator, so u lies within the limits.
+    - The expected error is the set point minus y, and `bounds` gives a lower bound of the mean
+      absolute error for each expected error.
+
+    So the controller's mean error is at least the minimum of the bounds over all u within the
+    limits. The minimum is a linear program, as each bound is a maximum of lines.
 
     The bound is loose where the required flow lies inside the dead zone: the mean of the flows
     0 and 5 t/h is 2.5 t/h, which no valve with a dead zone of 5 t/h passes. The bound is also
@@ -136,12 +138,12 @@ def plan(
     ----------
     model
         The plant, for at least as many samples as `setpoint` has.
-    unknown
-        The lower bounds of E|m - n| for this plant.
+    bounds
+        The lower bounds of the mean absolute errors for this plant.
     setpoint
         Set points y_d(k), degC, shape (samples,).
     past
-        Flows at k = 0, 1, ... that are already decided, t/h, shape (start,).
+        Flows at k = 0, 1, ... that are already decided, t/h, shape (decided,).
     quiet
         Whether to prefer, among plans with equal errors, the plan that reaches the set point
         with the least valve travel.
@@ -155,38 +157,18 @@ def plan(
         If no solver solves the linear program within `TIME_LIMIT`.
     """
     samples = len(setpoint)
-    start = np.size(past)
-    price = np.broadcast_to(np.asarray(penalty, float), samples)
-    A, B = equations(model, samples)
     flow = np.zeros(samples)
-    flow[:start] = past
-    n = samples - 1 - start  # outputs after `start`, and flows from `start` on
-    if n:
-        output_of_past = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
-        lengths = np.repeat(unknown.lengths[start + 1 : samples], 2, axis=1).T.ravel()
-        slopes = unknown.slopes
-        targets = (setpoint - output_of_past)[start + 1 :]
-        moves = 0
-        if quiet:
-            # A line may be level near m = 0, where a quiet plan needs a slope.
-            slopes = np.maximum(slopes, SMALLEST_SLOPE)
-            last_flow = flow[start - 1]  # from which the first move starts; 0 at the beginning
-            targets = np.concatenate([targets, [last_flow], np.zeros(n - 1)])
-            moves = 2 * n
-        program = _Program(
-            A=A[start + 1 :, start + 1 :],
-            B=B[start + 1 :, start:-1],
-            targets=targets,
-            outputs=_variables(n, 0.0, -np.inf, np.inf),
-            flows=_variables(n, price[start:-1], *model.limits),
-            pieces=_variables(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
-            moves=_variables(moves, TRAVEL_PRICE, 0.0, np.inf),
-        )
-        flow[start:-1] = _solve(program, zeros=np.roots(model.parameters.b))
+    decided = np.size(past)
+    flow[:decided] = past
+    if decided < samples - 1:
+        price = np.broadcast_to(np.asarray(penalty, float), samples)
+        program = _program(model, bounds, setpoint, flow, decided, quiet, price)
+        flow[decided:-1] = _solve(program, zeros=np.roots(model.parameters.b))
     if samples > 1:
         flow[-1] = flow[-2]  # The last flow affects no output; it costs nothing if it stays.
+    A, B = equations(model, samples)
     output = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
-    return Plan(unknown.mean_error(setpoint - output), flow)
+    return Plan(bounds.mean_error(setpoint - output), flow)
 
 
 class _Variables(NamedTuple):
@@ -198,23 +180,22 @@ class _Variables(NamedTuple):
 
 
 def _variables(count: int, cost: Any, low: Any, high: Any) -> _Variables:
-    """Return `count` variables of a linear program.
+    """Return `count` variables of a linear program, with numbers repeated for all variables.
 
-    `cost` is the cost of each unit of a variable, and `low` and `high` are the bounds of the
-    variables. Each is an array of shape (count,), or a number for all variables.
+    `cost`, `low` and `high` are arrays of shape (count,), or numbers.
     """
     return _Variables(*(np.broadcast_to(values, count) for values in (cost, low, high)))
 
 
 class _Program(NamedTuple):
-    """The linear program of `plan` over n samples.
+    """The linear program of `plan` for the n flows that are not decided yet.
 
-    The outputs y and the flows u satisfy A y = B u. The expected error m(k) is a sum of pieces
-    above 0 and pieces below 0, one of each for every slope of its bound. The first n targets
-    are the set points minus the effects of past flows: target k equals output k, plus the
-    pieces of m(k) above 0, minus the pieces of m(k) below 0. A quiet plan, which limits valve
-    travel, has n more targets: each equals flow k minus flow k - 1, minus the move up, plus the
-    move down. These n targets are 0, except the first, which is the last past flow.
+    The outputs y and the flows u satisfy A y = B u. The expected error at k is the sum of
+    positive pieces minus the sum of negative pieces. There is a piece of each sign for every
+    slope of the bound. The first n targets are the set points minus the effects of past flows:
+    target k equals output k plus the expected error at k. A quiet plan, which limits valve
+    travel, has n more targets: target n + k equals flow k minus flow k - 1, minus the move up,
+    plus the move down. Target n is the last past flow, and the targets after n are 0.
     """
 
     A: Any  # sparse matrix of the plant, shape (n, n)
@@ -222,17 +203,67 @@ class _Program(NamedTuple):
     targets: Array  # right sides, shape (n,), or (2 n,) in a quiet plan
     outputs: _Variables  # the effects of the flows on the outputs, degC, n variables
     flows: _Variables  # t/h, n variables
-    pieces: _Variables  # pieces of m, degC: for each slope, n above 0 and then n below 0
+    # Pieces of the expected errors, degC: for each slope, n positive and n negative pieces.
+    pieces: _Variables
     moves: _Variables  # t/h: n moves up and n moves down in a quiet plan, otherwise none
 
 
+def _program(
+    model: LinearModel,
+    bounds: ErrorBounds,
+    setpoint: Array,
+    flow: Array,
+    decided: int,
+    quiet: bool,
+    price: Array,
+) -> _Program:
+    """Return the linear program of `plan`, whose solution has the flows that are not decided.
+
+    Parameters
+    ----------
+    model, bounds, setpoint, quiet
+        Arguments of `plan`.
+    flow
+        The flows that are decided, and 0 for all later flows, t/h, shape (samples,).
+    decided
+        The number of flows that are decided.
+    price
+        The price of each flow, degC for each t/h, shape (samples,).
+    """
+    samples = len(setpoint)
+    first = decided + 1  # the first output after the decided flows
+    n = samples - first
+    A, B = equations(model, samples)
+    output_of_past = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
+    targets = (setpoint - output_of_past)[first:]
+    slopes = bounds.slopes
+    moves = 0
+    if quiet:
+        # A line may be level near an error of 0, where a quiet plan needs a slope.
+        slopes = np.maximum(slopes, SMALLEST_SLOPE)
+        last_flow = flow[decided - 1]  # 0 if no flow is decided
+        targets = np.concatenate([targets, [last_flow], np.zeros(n - 1)])
+        moves = 2 * n
+    # In the order of `_Program.pieces`.
+    lengths = np.repeat(bounds.lengths[first:samples], 2, axis=1).T.ravel()
+    return _Program(
+        A=A[first:, first:],
+        B=B[first:, decided:-1],
+        targets=targets,
+        outputs=_variables(n, 0.0, -np.inf, np.inf),
+        flows=_variables(n, price[decided:-1], *model.limits),
+        pieces=_variables(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
+        moves=_variables(moves, TRAVEL_PRICE, 0.0, np.inf),
+    )
+
+
 def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
-    """Return the flows with the least cost, t/h, shape (n,).
+    """Return the flows of a linear program with the least cost, t/h, shape (n,).
 
     Parameters
     ----------
     program
-        The linear program.
+        The linear program, with n flows.
     zeros
         The zeros of the polynomial B in equation (28) of the paper.
 
@@ -274,53 +305,56 @@ def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
 def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
     """Return the equality constraints of a program: a matrix M and a vector r with M x = r.
 
-    The vector x holds all variables of `program`: outputs, if `with_outputs`, then flows,
-    pieces and moves. Without outputs among the variables, an output is expressed as the sum of
-    the effects of the flows. M is sparse.
+    The vector x holds the flows, pieces and moves of `program`, after the outputs if
+    `with_outputs` is true. If `with_outputs` is false, the equations contain the effects of the
+    flows in place of the outputs. M is sparse.
     """
     n = len(program.flows.cost)
     rows = len(program.targets)
     eye = scipy.sparse.eye_array(n)
     differences = eye - scipy.sparse.eye_array(n, k=-1)
-    of_outputs = scipy.sparse.eye_array(rows, n)
-    of_flows = scipy.sparse.eye_array(rows, n, k=-n, format="csr") @ differences
-    of_pieces = scipy.sparse.hstack([eye, -eye] * (len(program.pieces.cost) // (2 * n)))
-    if rows > n:
-        of_pieces = scipy.sparse.block_diag([of_pieces, scipy.sparse.hstack([-eye, eye])])
+    slopes = len(program.pieces.cost) // (2 * n)
+    # The columns of the variables in the rows of the targets.
+    output_columns = scipy.sparse.eye_array(rows, n)
+    flow_columns = scipy.sparse.eye_array(rows, n, k=-n, format="csr") @ differences
+    piece_columns = scipy.sparse.hstack([eye, -eye] * slopes)
+    if rows > n:  # a quiet plan, with moves after the pieces
+        move_columns = scipy.sparse.hstack([-eye, eye])
+        piece_columns = scipy.sparse.block_diag([piece_columns, move_columns])
     if with_outputs:
-        blocks: Any = [[program.A, -program.B, None], [of_outputs, of_flows, of_pieces]]
+        plant_rows = [program.A, -program.B, None]
+        blocks: Any = [plant_rows, [output_columns, flow_columns, piece_columns]]
         right = np.concatenate([np.zeros(n), program.targets])
     else:
         G = response(program.A, program.B)
         G[np.abs(G) < NEGLIGIBLE_RESPONSE * np.abs(G).max(initial=0.0)] = 0.0
-        blocks = [[of_outputs @ scipy.sparse.csr_array(G) + of_flows, of_pieces]]
+        effects = output_columns @ scipy.sparse.csr_array(G)
+        blocks = [[effects + flow_columns, piece_columns]]
         right = program.targets
     return scipy.sparse.block_array(blocks).tocsc(), right
 
 
-def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
+def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
     """Return the plan of a controller that never expects another change of the set point.
 
-    For set points that are not random (a square wave, a list), the only lower bound is the
-    bound for controllers with preview, as a controller may have the times of all changes built
-    in. The reference replaces a bound without preview. At each change of the set point, the
-    controller chooses the flow that is best if the new set point stays for ever. If the plant
-    has settled before the next change, each change causes the least error that is possible
-    without preview; see `plan`.
+    At each change of the set point, the controller chooses the flow that is best if the new set
+    point stays for ever. If the plant has settled before each change, no controller that is
+    surprised by the changes has a smaller error. The reference is not a lower bound, since a
+    controller can have the times of all changes of a square wave built in.
 
     Parameters
     ----------
     model
-        The plant, for `model.lag + TAIL` samples more than `setpoint` has.
-    unknown
-        The lower bounds of E|m - n| for this plant; see `unknown.py`.
+        The plant, for `model.lag + LOOKAHEAD` samples more than `setpoint` has.
+    bounds
+        The lower bounds of the mean absolute errors for this plant.
     setpoint
         Set points y_d(k), degC, shape (samples,).
 
     Raises
     ------
     NoBoundError
-        If the plant has not settled when the set point changes.
+        If the set point changes before the plant has settled.
     RuntimeError
         If no solver solves a linear program within `TIME_LIMIT`.
     """
@@ -329,15 +363,17 @@ def reference(model: LinearModel, unknown: Unknown, setpoint: Array) -> Plan:
     errors = np.zeros(len(setpoint))
     for start, stop in held(setpoint):
         is_last = stop == len(setpoint)
-        ahead = setpoint[:stop]
+        expected_setpoint = setpoint[:stop]
         if not is_last:
-            beyond = np.full(model.lag + TAIL, setpoint[start])
-            ahead = np.concatenate([ahead, beyond])
-        planned = plan(model, unknown, ahead, past=flow[:start], quiet=True)
+            beyond = np.full(model.lag + LOOKAHEAD, setpoint[start])
+            expected_setpoint = np.concatenate([expected_setpoint, beyond])
+        planned = plan(model, bounds, expected_setpoint, past=flow[:start], quiet=True)
         flow = planned.flow
         errors[start:stop] = planned.errors[start:stop]
-        moves = np.ptp(flow[max(stop - model.lag - 1, start - 1, 0) : stop])  # t/h
-        has_settled = stop - start >= model.lag and moves <= SETTLED * (high - low)
+        # The range of the flows that affect outputs after the change, t/h.
+        flow_range = np.ptp(flow[max(stop - model.lag - 1, start - 1, 0) : stop])
+        is_long = stop - start >= model.lag
+        has_settled = is_long and flow_range <= SETTLED_FLOW_RANGE * (high - low)
         if not (is_last or has_settled):
             raise NoBoundError(
                 "setpoint must be held until the plant has settled, or there is no reference; "

@@ -21,7 +21,7 @@ from benchmarks.controllers.roster import label
 from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate, written
-from benchmarks.loop.rollout import CHANGE, START
+from benchmarks.loop.rollout import RESPONSE_SAMPLES, START_SAMPLES
 from benchmarks.loop.scenarios import Scenario
 
 SCORE = (
@@ -62,8 +62,8 @@ ROBUST = (
 )
 MISFIT = "†"  # marks controllers that were made for another plant
 PARTS = {  # the columns of a part of the mean error, and of the mean error
-    "mae_start": f"first {START} samples",
-    "mae_changes": f"{CHANGE} samples after later changes",
+    "mae_start": f"first {START_SAMPLES} samples",
+    "mae_changes": f"{RESPONSE_SAMPLES} samples after later changes",
     "mae_steady": "the rest",
     "mae": "together",
 }

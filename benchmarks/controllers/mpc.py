@@ -1,8 +1,8 @@
-"""Implement model predictive control (MPC) with an exact model of the plant and the actuator.
+"""Control the plant by model predictive control (MPC), with an exact model of the plant.
 
-The controller knows all parameters of the plant, the noise and the load, but no future noise,
-loads and set points. The errors of the controller show how close a controller can come to the
-error bounds of `benchmarks.bounds`.
+The controller knows all parameters of the plant, the noise and the load, but neither future
+noise and loads nor future set points. The mean error of the controller shows how close a
+controller can come to the error bounds of `benchmarks.bounds`.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from agents.actuator import applied_flow, float32_action
 from agents.hedge import RandomSetpoint
-from benchmarks.loop.linear import LinearModel
+from benchmarks.loop.linear import LOAD_STEPS, LOAD_WALK, LinearModel
 from benchmarks.loop.rollout import drawn_numbers
 from mptc_gym import Parameters
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL
@@ -21,9 +21,11 @@ from mptc_gym.plant.signals import LOAD_INTERVAL, SetPointLevels
 Array = NDArray[np.float64]
 
 HORIZON = 5  # flows in a plan, one a sample; the first flow is applied, then all are replanned
-SWEEPS = 100  # limit of the sweeps of coordinate descent, to bound the time of a sample
+MOST_SWEEPS = 100  # of coordinate descent, to bound the time of a sample
 TOLERANCE = 1e-4  # t/h; coordinate descent stops if a sweep changes no flow by this much
-TINY = 1e-9  # added to variances, degC^2, and to divisors, so that none of them is 0
+SMALL_VARIANCE = 1e-9  # degC^2; added to the variance of the noise, so that it is above 0
+SMALL_DEVIATION = 1e-9  # degC; least standard deviation of a forecast error, in place of 0
+SMALLEST_CURVATURE = np.finfo(np.float64).tiny  # degC^2 per (t/h)^2; a divisor in place of 0
 WARM_UP = 200  # samples until the covariance of the Kalman filter hardly changes
 
 
@@ -37,18 +39,19 @@ class _Model:
         The plants of all runs.
     response : Array
         The matrix G, shape (n, HORIZON, HORIZON), degC per t/h. G times the planned flows is
-        the change of the first HORIZON outputs that these flows can affect.
+        the change of the first HORIZON outputs that can depend on the planned flows.
     hessian : Array
-        The product of the transpose of G and G, shape (n, HORIZON, HORIZON).
-    rows : Array
-        `hessian` with the axis of the runs last, shape (HORIZON, HORIZON, n): operations on all
-        runs are faster in this order.
+        The transpose of G times G, shape (HORIZON, HORIZON, n). The axis of the runs is last,
+        as operations on all runs are faster in this order.
+    curvature : Array
+        The second derivative of the cost by each planned flow, shape (HORIZON, n). A flow that
+        affects no output within the horizon has the curvature `SMALLEST_CURVATURE`, not 0.
     """
 
     plants: LinearModel
     response: Array
     hessian: Array
-    rows: Array
+    curvature: Array
 
     @classmethod
     def of(cls, plants: LinearModel) -> "_Model":
@@ -57,25 +60,27 @@ class _Model:
         response = np.zeros((len(impulse_response), HORIZON, HORIZON))
         for j in range(HORIZON):
             response[:, j:, j] = impulse_response[:, : HORIZON - j]
-        hessian = response.transpose(0, 2, 1) @ response
-        rows = np.ascontiguousarray(hessian.transpose(1, 2, 0))
-        return cls(plants, response, hessian, rows)
+        products = response.transpose(0, 2, 1) @ response
+        hessian = np.ascontiguousarray(products.transpose(1, 2, 0))
+        diagonal = np.diagonal(hessian).T
+        curvature = np.ascontiguousarray(np.maximum(diagonal, SMALLEST_CURVATURE))
+        return cls(plants, response, hessian, curvature)
 
     def cost(self, plan: Array, slopes: Array) -> Array:
         """Return the cost of a plan in each of n runs, degC^2, shape (n,).
 
-        The cost is half the sum of squared differences between the targets and the outputs with
-        the plan, without the part of the sum that does not depend on the plan.
+        The cost is half the sum of squared differences between the target outputs and the
+        outputs with the plan, minus a number that does not depend on the plan.
 
         Parameters
         ----------
         plan
             The planned flows, t/h, shape (HORIZON, n).
         slopes
-            The transpose of G times the differences between the targets and the outputs that
-            are expected without the planned flows, shape (HORIZON, n).
+            How fast the cost falls with each planned flow if all planned flows are 0, degC^2
+            per t/h, shape (HORIZON, n).
         """
-        quadratic = np.einsum("in,nij,jn->n", plan, self.hessian, plan) / 2.0
+        quadratic = np.einsum("in,ijn,jn->n", plan, self.hessian, plan) / 2.0
         return np.asarray(quadratic - (slopes * plan).sum(axis=0))
 
 
@@ -85,20 +90,20 @@ class PredictiveController:
     The controller knows the polynomials A, B and C and the delay d of the plant, equation (28)
     of the paper, and how A and B drift, even if the plant is random and differs from run to
     run. A Kalman filter estimates the output, the white noise xi and the load from the
-    transmitter's readings. The load jumps, so the load is not normally distributed; the Kalman
-    filter is then still the best linear filter.
+    transmitter's readings. The load jumps and is not normally distributed, so the Kalman filter
+    is the best linear filter, but not the best filter.
 
-    The score depends on the mean of |e|, the absolute error. So the expected outputs are
-    medians, and the load is expected to stay as it is. The planned flows minimise the sum of
-    squared differences between the expected outputs and the target outputs, for flows within
-    the limits of the actuator. The sum is over the first HORIZON outputs that the planned flows
-    can affect. A first planned flow inside the dead zone is replaced by 0 or by the flow at the
-    edge of the dead zone, whichever gives the plan with the smaller sum.
+    The score depends on the mean of |e|, the absolute error, which is least if the median of
+    the output is at the set point. So the expected outputs are medians, and the load is
+    expected to stay as it is. The planned flows minimise the sum of squared differences between
+    expected outputs and target outputs. The sum has HORIZON outputs, from the first output on
+    that can depend on the planned flows. All planned flows lie within the limits of the
+    actuator. If the first planned flow lies inside the dead zone, the flow becomes 0 or the
+    flow at the edge of the dead zone, whichever gives the smaller sum.
 
-    The target outputs are equal to the present set point, as if the set point never changed. If
-    the environment draws set points at random, the time since the latest set-point change shows
-    how likely the set point is to change within the delay, and `agents.hedge` computes the
-    target outputs.
+    The target outputs are equal to the present set point, as if the set point never changed.
+    But if set points are random, the controller computes from the time since the latest change
+    how likely a change within the delay is, and `agents.hedge` chooses the target outputs.
 
     Parameters
     ----------
@@ -116,46 +121,50 @@ class PredictiveController:
         self._num_envs = num_envs
         self._numbers = drawn_numbers(parameters, num_envs, seed)
         self._delay = self._numbers.delay.astype(np.intp)
+        self._longest_delay = int(self._delay.max())
         # At each sample at which the load may step, it steps with the probability p. A load of
         # x degC then becomes (1 - p) x in the mean; the variance of the load stays the same.
-        interval = self._numbers.disturbance_interval
-        self._load_stays = 1.0 - np.minimum(LOAD_INTERVAL / interval, 1.0)
-        load_variance = (
-            np.square(self._numbers.disturbance_amplitude) / 3.0
-        )  # of a uniform level
-        steps_variance = load_variance * (1.0 - np.square(self._load_stays))
+        step_probability = np.minimum(LOAD_INTERVAL / self._numbers.disturbance_interval, 1.0)
+        self._load_stays = 1.0 - step_probability
+        # The variance of a level that is uniformly distributed within the amplitude.
+        level_variance = np.square(self._numbers.disturbance_amplitude) / 3.0
+        step_variance = level_variance * (1.0 - np.square(self._load_stays))
         walk_variance = LOAD_INTERVAL * self._numbers.disturbance_walk_variance
-        noise_variance = self._numbers.noise_variance + TINY
-        self._variances = np.stack([noise_variance, steps_variance, walk_variance], axis=1)
-        # The state: y(k), y(k-1), ...; xi(k), xi(k-1), ...; the steps of the load and its walk.
-        self._n_y = max(len(parameters.a) - 1, 1)
-        self._size = self._n_y + len(parameters.c) - 1 + 2
-        # For each output from y(k) on and each coefficient of B: the index, in `_inputs`, of
-        # the flow that the coefficient multiplies; 0 for flows from u(k) on, not yet decided.
-        ahead = np.arange(int(self._delay.max()) + HORIZON + 1)[:, np.newaxis]
-        lag = np.arange(len(parameters.b)) + 1
-        self._shows = (self._delay[:, np.newaxis, np.newaxis] + lag - ahead).clip(0)
-        self._reached = self._delay[:, np.newaxis] + np.arange(HORIZON, dtype=np.intp)
+        noise_variance = self._numbers.noise_variance + SMALL_VARIANCE
+        # The variances of v(k) in `LinearModel.state_space_with_load`, degC^2, shape (runs, 3).
+        self._variances = np.stack([noise_variance, step_variance, walk_variance], axis=1)
+        # Flow i of a plan affects the output y(k + 1 + delay + i) at the earliest. Here are the
+        # columns of these outputs in the outputs of `_predict`, shape (runs, HORIZON).
+        self._reached_columns = self._delay[:, np.newaxis] + np.arange(HORIZON, dtype=np.intp)
+        # Coefficient i of B multiplies u_a(k + ahead - d - 1 - i) in the output y(k + ahead).
+        # Here is the column of this flow in `_flows`, shape (runs, outputs, coefficients).
+        ahead = np.arange(self._longest_delay + HORIZON + 1)[:, np.newaxis]
+        samples_back = self._delay[:, np.newaxis, np.newaxis] + 1 + np.arange(len(parameters.b))
+        self._flow_columns = np.maximum(samples_back - ahead, 0)
         self._models: dict[int, _Model] = {}  # by the sample from which the coefficients hold
         self._random: RandomSetpoint | None = None
         levels = SetPointLevels(parameters)
-        if levels.random:
+        if levels.random and levels.amplitude > 0.0:
             self._random = RandomSetpoint(levels.shortest, levels.longest, levels.amplitude)
-            self._deviation = self._forecast_deviation()
+            deviation = self._forecast_deviation()
+            self._deviation = np.maximum(deviation, SMALL_DEVIATION)
         self.reset()
 
     def reset(self) -> None:
         """Prepare for a new episode: forget all readings and flows, as the plant is at rest."""
-        n = self._num_envs
+        runs = self._num_envs
+        order = self._model(0).plants.outputs_in_state
+        size = order + len(self._parameters.c) - 1 + 2  # with the two parts of the load
         self._k = 0
-        self._state = np.zeros((n, self._size))
-        self._covariance = np.zeros((n, self._size, self._size))
-        # u(k-1), u(k-2), ..., after a 0 that stands for future inputs.
-        longest_memory = int(self._delay.max()) + len(self._parameters.b)
-        self._inputs = np.zeros((n, 1 + longest_memory))
-        self._plan = np.zeros((HORIZON, n))
-        self._setpoint = np.full(n, np.nan)  # the latest set point, degC
-        self._age = np.zeros(n, np.intp)  # samples since the set point changed
+        # The state of the plants, as `LinearModel.state_space_with_load` describes it.
+        self._state = np.zeros((runs, size))
+        self._covariance = np.zeros((runs, size, size))
+        # Column j has the flow u_a(k - j), t/h. Column 0 stays 0: `_predict` takes the flows
+        # from the present sample on to be 0.
+        self._flows = np.zeros((runs, 1 + self._longest_delay + len(self._parameters.b)))
+        self._plan = np.zeros((HORIZON, runs))
+        self._setpoint = np.full(runs, np.nan)  # the latest set point, degC
+        self._age = np.zeros(runs, np.intp)  # samples since the set point changed
 
     def act(self, observation: Array) -> NDArray[np.float32]:
         """Return the actions of a sample, from -1 to 1, shape (runs, 1).
@@ -165,37 +174,25 @@ class PredictiveController:
         """
         observation = np.asarray(observation, dtype=np.float64)
         setpoint = observation[:, 0]
-        if self._k > 0:
+        if self._k > 0:  # The state at k = 0 is known: the plant is at rest.
             error = observation[:, self._parameters.setpoint_window]
             self._filter(setpoint - error)
         model = self._model(self._k)
-        free_outputs = np.take_along_axis(self._predict(), self._reached, axis=1)
-        missing = self._aims(setpoint) - free_outputs
-        slopes = np.ascontiguousarray(np.einsum("ni,nij->nj", missing, model.response).T)
+        free_outputs = np.take_along_axis(self._predict(), self._reached_columns, axis=1)
+        differences = self._targets(setpoint) - free_outputs
+        slopes = np.ascontiguousarray(np.einsum("ni,nij->nj", differences, model.response).T)
+        # The last plan, a sample later, with the last flow held.
         start = np.vstack([self._plan[1:], self._plan[-1:]])
         plan = self._optimise(model, slopes, start)
-        command = plan[0].copy()
-        is_inside = np.abs(command) < self._numbers.dead_zone
-        if is_inside.any():
-            edge = np.copysign(self._numbers.dead_zone, command)
-            flow = applied_flow(
-                edge, self._numbers.dead_zone, self._numbers.u_min, self._numbers.u_max
-            )
-            resting_plan = self._optimise(model, slopes, plan, first_flow=0.0)
-            edge_plan = self._optimise(model, slopes, plan, first_flow=flow)
-            rests = model.cost(resting_plan, slopes) <= model.cost(edge_plan, slopes)
-            plan = np.where(is_inside, np.where(rests, resting_plan, edge_plan), plan)
-            command = np.where(is_inside, np.where(rests, 0.0, edge), command)
-        self._plan = plan
-        self._inputs[:, 2:] = self._inputs[:, 1:-1].copy()
-        self._inputs[:, 1] = plan[0]
+        self._plan, command = self._avoid_dead_zone(model, slopes, plan)
+        self._flows[:, 2:] = self._flows[:, 1:-1].copy()
+        self._flows[:, 1] = self._plan[0]
         self._k += 1
-        action = float32_action(
-            command, self._numbers.u_min, self._numbers.u_max, self._numbers.dead_zone
-        )
+        numbers = self._numbers
+        action = float32_action(command, numbers.u_min, numbers.u_max, numbers.dead_zone)
         return action[:, np.newaxis]
 
-    def _aims(self, setpoint: Array) -> Array:
+    def _targets(self, setpoint: Array) -> Array:
         """Return the target outputs, degC, shape (runs, HORIZON); called once a sample.
 
         Column i has the target of the output that the planned flow i is the first to affect.
@@ -206,17 +203,17 @@ class PredictiveController:
         self._age = np.where(setpoint == self._setpoint, self._age + 1, 0)
         self._setpoint = setpoint
         ages = self._age[:, np.newaxis].astype(np.float64)
-        held = self._random.probability_held(ages, self._reached + 1.0)
-        deviation = np.maximum(self._deviation, TINY)[:, np.newaxis]
-        return np.asarray(
-            self._random.targets(setpoint[:, np.newaxis], held, deviation), np.float64
-        )
+        held = self._random.probability_held(ages, self._reached_columns + 1.0)
+        deviation = self._deviation[:, np.newaxis]
+        targets = self._random.targets(setpoint[:, np.newaxis], held, deviation)
+        return np.asarray(targets, np.float64)
 
     def _forecast_deviation(self) -> Array:
         """Return the standard deviation of the forecast error of each run, degC, shape (runs,).
 
-        The forecast is of the first output that a new command affects. The Kalman filter is
-        taken to have settled, and the plant is taken not to drift.
+        The forecast is the expected value of the first output that the next flow can affect.
+        The Kalman filter is taken to have settled, and the plant is taken not to drift. The
+        controller must be reset afterwards.
         """
         self.reset()
         plants = self._model(0).plants
@@ -224,24 +221,24 @@ class PredictiveController:
             self._update_covariance(*self._transition(k, plants))
         P = self._covariance
         variance = np.zeros(self._num_envs)
-        for ahead in range(int(self._delay.max()) + 1):
-            F, Q = self._transition(WARM_UP + ahead, plants)
+        for delay in range(self._longest_delay + 1):
+            F, Q = self._transition(WARM_UP + delay, plants)
             P = F @ P @ F.transpose(0, 2, 1) + Q
-            variance = np.where(ahead == self._delay, P[:, 0, 0], variance)
+            variance = np.where(delay == self._delay, P[:, 0, 0], variance)
         return np.sqrt(variance)
 
-    def _filter(self, output: Array) -> None:
-        """Advance the Kalman filter from sample k - 1 to the present sample k.
+    def _filter(self, reading: Array) -> None:
+        """Advance the state and the covariance of the Kalman filter from sample k - 1 to k.
 
-        `output` has the transmitter's readings at sample k, degC, shape (runs,).
+        `reading` has the transmitter's readings at the present sample k, degC, shape (runs,).
         """
         plants = self._model(self._k).plants
         F, Q = self._transition(self._k, plants)
         state = np.einsum("nij,nj->ni", F, self._state)
-        flows = np.take_along_axis(self._inputs, self._shows[:, 0], axis=1)
+        flows = np.take_along_axis(self._flows, self._flow_columns[:, 0], axis=1)
         state[:, 0] += (flows * plants.beta).sum(axis=1)
         gain = self._update_covariance(F, Q)
-        self._state = state + gain * (output - state[:, 0])[:, np.newaxis]
+        self._state = state + gain * (reading - state[:, 0])[:, np.newaxis]
 
     def _update_covariance(self, F: Array, Q: Array) -> Array:
         """Advance the Kalman filter's covariance by a sample, and return the filter's gain.
@@ -263,20 +260,13 @@ class PredictiveController:
         shape (runs, size, size), where size is the length of the state. `plants` has the
         plants of all runs at sample k.
         """
-        load_changes = k % LOAD_INTERVAL == 0
-        steps, walk = self._size - 2, self._size - 1  # the parts of the load in the state
-        F = np.zeros((self._num_envs, self._size, self._size))
-        sources = np.zeros((self._num_envs, self._size, 3))  # xi, the steps and the walk
-        F[:, :steps, :steps], sources[:, :steps, 0] = plants.state_space()
-        F[:, steps, steps] = self._load_stays if load_changes else 1.0
-        F[:, walk, walk] = 1.0
-        F[:, 0, steps] = plants.load * F[:, steps, steps]
-        F[:, 0, walk] = plants.load
-        sources[:, 0, 1:] = plants.load[:, np.newaxis]
-        sources[:, steps, 1] = 1.0
-        sources[:, walk, 2] = 1.0
-        variances = self._variances * [1, load_changes, load_changes]
-        return F, np.einsum("nk,nik,njk->nij", variances, sources, sources)
+        stays = self._load_stays
+        variances = self._variances
+        if k % LOAD_INTERVAL:  # The load does not change at this sample.
+            stays = np.ones_like(stays)
+            variances = variances * [1.0, 0.0, 0.0]
+        F, sources = plants.state_space_with_load(stays)
+        return F, np.einsum("nv,niv,njv->nij", variances, sources, sources)
 
     def _predict(self) -> Array:
         """Return the outputs that are expected if all flows from the present sample k on are 0.
@@ -284,23 +274,24 @@ class PredictiveController:
         Column i has the outputs y(k + 1 + i), degC, of all runs. The shape is
         (runs, longest delay + HORIZON).
         """
-        c = self._parameters.c
         runs = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
-        flows = self._inputs[runs, self._shows[:, 1:]]
-        models = [self._model(self._k + 1 + ahead).plants for ahead in range(flows.shape[1])]
+        flows = self._flows[runs, self._flow_columns[:, 1:]]
+        models = [self._model(self._k + 1 + i).plants for i in range(flows.shape[1])]
         flows *= np.stack([plants.beta for plants in models], axis=1)
-        responses = flows.sum(axis=2)
-        outputs = [self._state[:, i] for i in reversed(range(self._n_y))]  # the newest last
-        xi = self._state[:, self._n_y : -2]
-        load = self._state[:, -2] + self._state[:, -1]
-        for ahead, plants in enumerate(models):
-            output = responses[:, ahead] + plants.load * load
-            for j in range(len(self._parameters.a) - 1):
-                output = output + plants.alpha[:, j] * outputs[-1 - j]
-            for j in range(ahead + 1, len(c)):
-                output = output + c[j] * xi[:, j - ahead - 1]
+        effects = flows.sum(axis=2)
+        c = self._parameters.c
+        order = models[0].outputs_in_state
+        noise = self._state[:, order:LOAD_STEPS]  # xi(k), xi(k-1), ...
+        load = self._state[:, LOAD_STEPS] + self._state[:, LOAD_WALK]
+        outputs = [self._state[:, i] for i in reversed(range(order))]  # the newest last
+        for ahead, plants in enumerate(models, start=1):  # y(k + ahead)
+            output = effects[:, ahead - 1] + plants.load * load
+            for i in range(plants.alpha.shape[-1]):
+                output += plants.alpha[:, i] * outputs[-1 - i]
+            for i in range(ahead, len(c)):  # The values of xi after k are expected to be 0.
+                output += c[i] * noise[:, i - ahead]
             outputs.append(output)
-        return np.stack(outputs[self._n_y :], axis=1)
+        return np.stack(outputs[order:], axis=1)
 
     def _model(self, k: int) -> _Model:
         """Return the plants of all runs in the step from sample k - 1 to sample k, as a model.
@@ -315,6 +306,43 @@ class PredictiveController:
             self._models[first] = _Model.of(plants)
         return self._models[first]
 
+    def _avoid_dead_zone(
+        self, model: _Model, slopes: Array, plan: Array
+    ) -> tuple[Array, Array]:
+        """Return a plan whose first flow the actuator can apply, and the command for this flow.
+
+        A first flow inside the dead zone is replaced by 0 or by the flow at the edge of the
+        dead zone, whichever has the lower cost, and the later flows are planned anew.
+
+        Parameters
+        ----------
+        model, slopes
+            The plants, and the second argument of `_Model.cost`.
+        plan
+            The planned flows, t/h, shape (HORIZON, runs).
+
+        Returns
+        -------
+        plan : Array
+            The changed plan, t/h, shape (HORIZON, runs).
+        command : Array
+            The command for the first planned flow, t/h, shape (runs,).
+        """
+        numbers = self._numbers
+        flow = plan[0]
+        is_inside = np.abs(flow) < numbers.dead_zone
+        if not is_inside.any():
+            return plan, flow
+        edge = np.copysign(numbers.dead_zone, flow)
+        # The flow differs from the command if a limit lies inside the dead zone.
+        edge_flow = applied_flow(edge, numbers.dead_zone, numbers.u_min, numbers.u_max)
+        idle_plan = self._optimise(model, slopes, plan, first_flow=0.0)
+        edge_plan = self._optimise(model, slopes, plan, first_flow=edge_flow)
+        is_idle = model.cost(idle_plan, slopes) <= model.cost(edge_plan, slopes)
+        new_plan = np.where(is_idle, idle_plan, edge_plan)
+        new_command = np.where(is_idle, 0.0, edge)
+        return np.where(is_inside, new_plan, plan), np.where(is_inside, new_command, flow)
+
     def _optimise(
         self,
         model: _Model,
@@ -328,27 +356,25 @@ class PredictiveController:
 
         Parameters
         ----------
-        model
-            The plants, for which `_Model.cost` is minimised.
-        slopes
-            The second argument of `_Model.cost`, shape (HORIZON, runs).
+        model, slopes
+            The plants, and the second argument of `_Model.cost`.
         start
             The planned flows with which the descent starts, t/h, shape (HORIZON, runs).
         first_flow
             A fixed value of the first planned flow, t/h, shape (runs,) or one number for all
-            runs; None if the first flow is chosen like the other flows.
+            runs; None if the first flow is chosen like all other flows.
         """
         plan = start.copy()
-        free = range(HORIZON)
+        free_flows = range(HORIZON)
         if first_flow is not None:
             plan[0] = first_flow
-            free = range(1, HORIZON)
-        for _ in range(SWEEPS):
+            free_flows = range(1, HORIZON)
+        for _ in range(MOST_SWEEPS):
             before = plan.copy()
-            for i in free:
-                # The derivative of the cost by this flow becomes 0 at the best flow.
-                descent = slopes[i] - np.add.reduce(plan * model.rows[i])
-                best = plan[i] + descent / model.rows[i, i]
+            for i in free_flows:
+                # At the best flow, the derivative of the cost by this flow is 0.
+                derivative = np.add.reduce(plan * model.hessian[i]) - slopes[i]
+                best = plan[i] - derivative / model.curvature[i]
                 np.maximum(best, self._numbers.u_min, out=best)
                 np.minimum(best, self._numbers.u_max, out=plan[i])
             if np.abs(plan - before).max() < TOLERANCE:

@@ -1,18 +1,18 @@
-"""Compare the gains, time constants, delays and reachable temperatures of two plants.
+"""Compare the gains, time constants, delays and temperature ranges of two plants.
 
-With the ratios of these four magnitudes, the intervals in which a search looks for the gains of
-a controller are converted from the paper's plant to another plant.
+With the ratios of these quantities, the intervals in which a search looks for the gains of a
+controller are converted from the paper's plant to another plant.
 """
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
-from mptc_gym.plant.parameters import slowest_pole
 
-# Two plants count as different if one of the four magnitudes differs by more than this factor.
-MUCH = 2.0
+# Two plants count as different if one of the quantities differs by more than this factor.
+LARGEST_RATIO = 2.0
 PAPER = Parameters()  # the paper's plant
 # The intervals in which a search on the paper's plant looks for each gain of a controller.
 PI_SPANS = {"kp": (0.1, 10.0), "ki": (1e-3, 1.0)}
@@ -29,67 +29,84 @@ NN_SPANS = {
 Spans = Mapping[str, tuple[float, float]]
 
 
+@dataclass(frozen=True)
+class PlantScale:
+    """Magnitudes of a plant, to which the gains of controllers are proportional.
+
+    If the plant is integrating, all but the delay are infinite.
+    """
+
+    gain: float  # magnitude of the steady-state gain, degC per t/h
+    temperature_range: float  # change of the steady temperature by half the flow's range, degC
+    time_constant: float  # samples
+    delay: float  # from a flow to the first output that the flow can affect, samples
+
+
+# The name and the unit of each field of `PlantScale` in messages.
+QUANTITIES = {
+    "gain": ("gain", "°C per t/h"),
+    "temperature_range": ("temperature change by half the flow's range", "°C"),
+    "time_constant": ("time constant", "samples"),
+    "delay": ("delay", "samples"),
+}
+
+
 def direction(plant: Parameters) -> int:
     """Return 1 if the steady temperature of a plant rises with the flow, and -1 otherwise."""
     return 1 if nominal(plant).gain > 0.0 else -1
 
 
-def scales(plant: Parameters) -> dict[str, float]:
-    """Return four magnitudes of the nominal plant, by a text of name and unit, "NAME, UNIT".
-
-    The magnitudes are the gain, the reach (the change of the steady temperature by half the
-    range of the flow), the time constant and the delay. If the plant is integrating, the gain,
-    the reach and the time constant are infinite. The nominal plant is the plant in the middle
-    of all ranges of `plant`.
-    """
+def scale_of(plant: Parameters) -> PlantScale:
+    """Return the magnitudes of the nominal plant, which is in the middle of all ranges."""
     model = nominal(plant)
     gain = abs(float(model.gain))
-    half_range = (model.numbers.u_max - model.numbers.u_min) / 2.0
-    pole = abs(slowest_pole((1.0, *-model.alpha)))
-    time_constant = math.inf if pole >= 1.0 else 0.0
-    if 0.0 < pole < 1.0:
-        time_constant = -1.0 / math.log(pole)
-    return {
-        "gain, °C per t/h": gain,
-        "reach of half the flow's range, °C": gain * half_range,
-        "time constant, samples": time_constant,
-        "delay, samples": model.numbers.delay + 1.0,
-    }
+    half_range = (model.numbers.u_max - model.numbers.u_min) / 2.0  # t/h
+    time_constant = 0.0
+    if model.slowest_pole >= 1.0:
+        time_constant = math.inf
+    elif model.slowest_pole > 0.0:
+        time_constant = -1.0 / math.log(model.slowest_pole)
+    return PlantScale(gain, gain * half_range, time_constant, model.numbers.delay + 1.0)
 
 
 def difference(plant: Parameters, made_for: Parameters) -> str:
-    """Return a text on the magnitudes of two plants that differ by a factor above `MUCH`.
+    """Return a text on the quantities of two plants that differ by a factor above 2.
 
-    The text has both values of each magnitude that differs, and is "" if no magnitude differs
-    by more than `MUCH`. The magnitudes are the gain, the reach, the time constant and the delay
-    that `scales` returns. `plant` is the plant on which a controller runs, and `made_for` is
-    the plant for which the controller was made.
+    An example is "the delay is 41 samples in place of 19". The text is "" if the plants do not
+    differ by so much.
+
+    Parameters
+    ----------
+    plant
+        The plant on which a controller runs.
+    made_for
+        The plant for which the controller was made.
     """
-    expected = scales(made_for)
+    expected = vars(scale_of(made_for))
     parts = []
-    for name, value in scales(plant).items():
-        if max(value, expected[name]) > MUCH * min(value, expected[name]):
-            quantity, unit = name.rsplit(", ", 1)
+    for name, value in vars(scale_of(plant)).items():
+        if max(value, expected[name]) > LARGEST_RATIO * min(value, expected[name]):
+            quantity, unit = QUANTITIES[name]
             parts.append(
                 f"the {quantity} is {value:.3g} {unit} in place of {expected[name]:.3g}"
             )
     return "; ".join(parts)
 
 
-def _finite_scales(plant: Parameters) -> dict[str, float]:
-    """Return the four magnitudes of `scales` for a plant on which gains are searched.
+def _finite_scale_of(plant: Parameters) -> PlantScale:
+    """Return the magnitudes of a plant on which a search for gains is to run.
 
-    A ValueError is raised if one of the magnitudes is 0 or infinite, since the intervals of a
-    search are proportional to ratios of magnitudes.
+    A ValueError is raised if a magnitude is 0 or infinite, since the intervals of a search are
+    proportional to ratios of magnitudes.
     """
-    numbers = scales(plant)
-    for name, value in numbers.items():
+    scale = scale_of(plant)
+    for name, value in vars(scale).items():
         if not 0.0 < value < math.inf:
-            quantity, unit = name.rsplit(", ", 1)
+            quantity, unit = QUANTITIES[name]
             raise ValueError(
                 f"the {quantity} must be finite and above 0 for a search, got {value:g} {unit}"
             )
-    return numbers
+    return scale
 
 
 def pi_spans(plant: Parameters) -> Spans:
@@ -100,13 +117,13 @@ def pi_spans(plant: Parameters) -> Spans:
     the paper's plant divided by the gain of `plant`. The interval of `ki` is also multiplied by
     the time constant of the paper's plant divided by the time constant of `plant`.
     """
-    numbers = _finite_scales(plant)
-    paper_numbers = scales(PAPER)
-    kp = paper_numbers["gain, °C per t/h"] / numbers["gain, °C per t/h"]
+    scale = _finite_scale_of(plant)
+    paper_scale = scale_of(PAPER)
+    kp_factor = paper_scale.gain / scale.gain
     if direction(plant) != direction(PAPER):
-        kp = -kp
-    ki = kp * paper_numbers["time constant, samples"] / numbers["time constant, samples"]
-    return _scaled(PI_SPANS, {"kp": kp, "ki": ki})
+        kp_factor = -kp_factor
+    ki_factor = kp_factor * paper_scale.time_constant / scale.time_constant
+    return _scaled(PI_SPANS, {"kp": kp_factor, "ki": ki_factor})
 
 
 def nn_spans(plant: Parameters) -> Spans:
@@ -117,8 +134,7 @@ def nn_spans(plant: Parameters) -> Spans:
     temperature changes that the flow can cause on the paper's plant and on `plant`. The
     interval for the initial weights, which have no unit, is the same for all plants.
     """
-    reach = "reach of half the flow's range, °C"
-    factor = scales(PAPER)[reach] / _finite_scales(plant)[reach]
+    factor = scale_of(PAPER).temperature_range / _finite_scale_of(plant).temperature_range
     factors = dict.fromkeys(NN_SPANS, factor) | {"weight_scale": 1.0}
     return _scaled(NN_SPANS, factors)
 
@@ -127,15 +143,14 @@ def dahlin_spans(plant: Parameters) -> Spans:
     """Return the intervals in which a search looks for Dahlin's two time constants, s.
 
     The intervals for the closed-loop and the filter time constant of Dahlin's controller are
-    fixed multiples of the time constant and the delay of `plant`.
+    proportional to the time constant of `plant`, and to its time constant plus delay.
     """
-    numbers = _finite_scales(plant)
-    interval = plant.sampling_interval
-    time_constant = numbers["time constant, samples"] * interval
-    horizon = time_constant + numbers["delay, samples"] * interval
+    scale = _finite_scale_of(plant)
+    time_constant = scale.time_constant * plant.sampling_interval
+    response_time = time_constant + scale.delay * plant.sampling_interval
     return {
         "closed_loop_time_constant": (0.02 * time_constant, time_constant),
-        "filter_time_constant": (0.02 * horizon, 2.0 * horizon),
+        "filter_time_constant": (0.02 * response_time, 2.0 * response_time),
     }
 
 

@@ -1,17 +1,16 @@
 """Describe the plant, and the loop of a controller and the plant, as linear systems.
 
-The functions do a step test on a plant, and compute how robust a loop is. The plant is equation
-(28) of the paper with a load:
+The plant is equation (28) of the paper with a load:
 
     y(k) = sum_i alpha_i y(k-1-i) + sum_i beta_i u_a(k-d-1-i) + C(z^-1) xi(k) + A(1) w(k),
 
 where i counts from 0, y is the temperature (degC), u_a the flow that the actuator applies
 (t/h), d the delay (samples), xi white noise (degC) and w the load (degC). The coefficients
-alpha_i and beta_i are those of the polynomials A and B of equation (28), after the factors and
-drifts of gain and time constant. Equation (29) of the paper is the actuator, with a dead zone
-and limits.
+alpha_i and beta_i are -a_(i+1) and b_i of the polynomials A and B, changed by the factors and
+drifts of gain and time constant.
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,32 +22,36 @@ from numpy.typing import NDArray
 
 from mptc_gym import Parameters
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics
-from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
+from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers, slowest_pole
 
 Array = NDArray[np.float64]
 
+# Places of the two parts of the load in a state vector: the piecewise constant part, which
+# changes in steps, and the random walk.
+LOAD_STEPS, LOAD_WALK = -2, -1
 # Smith's method reads the times at which a step response reaches these shares of its final
-# value. A lag with the time constant T reaches them after T / 3 and T.
+# value. A lag with the time constant T reaches the two shares after T / 3 and T.
 EARLY_LEVEL, LATE_LEVEL = 0.283, 0.632
 # Largest magnitude of a pole for which a step test is done: a step test would be too long for a
 # slower plant.
 SLOWEST_POLE = 1 - 1e-5
-TRANSIENT = 1e-5  # share of the slowest transient that may remain at the end of a step test
+REMAINING_TRANSIENT = 1e-5  # share of the slowest transient at the end of a step test
 # Frequencies at which the sensitivity function is computed, rad per sample; pi is the highest
 # frequency of a sampled signal.
 FREQUENCIES = np.geomspace(1e-4, math.pi, 400)
 CIRCLE_POINTS = 1 << 14  # points on the unit circle with which unstable poles are counted
 LONGEST_DELAY = 1000  # samples; longer delays are not examined for stability
-GRID = 24  # number of time constants that `time_constant_for` tries before the bisection
+TIME_CONSTANTS_TRIED = 24  # by `time_constant_for`, before the bisection
 PRECISION = 1e-5  # relative precision of the time constant that `time_constant_for` returns
 
 
 class LinearModel:
-    """One plant or several plants, equation (28) of the paper, as linear systems at one sample.
+    """The linear equation (28) of the paper for several plants, or for one plant.
 
-    The coefficients of a plant that drifts hold for the step from sample k - 1 to sample k.
-    A model can also have one plant at several samples k. In the shapes below, the dots stand
-    for the axis of the plants or of the samples, which is missing for one plant at one sample.
+    A model has several plants at one sample k, or one plant at several samples k, or one plant
+    at one sample. The coefficients of a plant that drifts hold for the step from k - 1 to k. In
+    the shapes below, the dots stand for the axis of the plants or of the samples, which is
+    missing for one plant at one sample.
 
     Parameters
     ----------
@@ -112,19 +115,23 @@ class LinearModel:
     def lag(self) -> int:
         """Number of samples from a flow to the first output that the flow can affect.
 
-        The model must have one plant. Leading zeros in the polynomial B of equation (28) of the
-        paper make the lag longer. If all coefficients of B are 0, a further one is taken to be
-        other than 0.
+        The lag is d + 1 for the delay d of the plant, plus the number of leading zeros in the
+        polynomial B of equation (28) of the paper. The model must have one plant.
         """
         first_nonzero = np.flatnonzero([*self.parameters.b, 1.0])[0]
         return int(self.numbers.delay) + 1 + int(first_nonzero)
+
+    @property
+    def slowest_pole(self) -> float:
+        """Largest magnitude of a pole of a single plant; 0 for a plant without poles."""
+        return abs(slowest_pole([1.0, *-self.alpha]))
 
     def impulse_response(self, samples: int) -> Array:
         """Return the impulse response of the plants, degC per t/h, shape (..., samples).
 
         The first value is the effect of a flow of 1 t/h at one sample on the output d + 1
-        samples later, where d is the delay of the plant in samples. The coefficients of the
-        plant are taken to stay as they are. `samples` is the number of values.
+        samples later, where d is the delay of the plant in samples. A drift of the plant is
+        left out.
         """
         response = np.zeros((*self.load.shape, samples))
         response[..., : self.beta.shape[-1]] = self.beta[..., :samples]
@@ -133,11 +140,16 @@ class LinearModel:
                 response[..., k] += self.alpha[..., i] * response[..., k - 1 - i]
         return response
 
+    @property
+    def outputs_in_state(self) -> int:
+        """Number of outputs y(k), y(k-1), ... at the start of the state of `state_space`."""
+        return max(len(self.parameters.a) - 1, 1)
+
     def state_space(self) -> tuple[Array, Array]:
         """Return the matrices F and g of the state equation x(k) = F x(k-1) + g xi(k).
 
         The state x(k) consists of the latest outputs y(k), y(k-1), ... and the latest values
-        xi(k), xi(k-1), ... of the white noise; flows and load are left out.
+        xi(k), xi(k-1), ... of the white noise. The effects of flows and load are left out.
 
         Returns
         -------
@@ -147,20 +159,59 @@ class LinearModel:
             The effect of the noise, elements 0 and 1, shape (size,).
         """
         c = self.parameters.c
-        order = max(self.alpha.shape[-1], 1)
+        order = self.outputs_in_state
         size = order + len(c) - 1
         F = np.zeros((*self.load.shape, size, size)) + np.eye(size, k=-1)
         F[..., order : order + 1, :] = 0.0  # xi(k) is new
         F[..., 0, : self.alpha.shape[-1]] = self.alpha
         F[..., 0, order:] = c[1:]
-        return F, np.isin(np.arange(size), (0, order)).astype(float)
+        g = np.zeros(size)
+        g[0] = 1.0
+        g[order : order + 1] = 1.0  # empty if C = 1: the state then has no noise
+        return F, g
+
+    def state_space_with_load(self, stays: Array) -> tuple[Array, Array]:
+        """Return the matrices F and E of the state equation x(k) = F x(k-1) + E v(k).
+
+        The state x(k) is the state of `state_space`, followed by the two parts of the load,
+        degC: the piecewise constant part at the place `LOAD_STEPS`, and the random walk at the
+        place `LOAD_WALK`. The effects of flows are left out. The vector v(k) has three
+        elements: the noise xi(k), the random change of the piecewise constant part, and the
+        step of the random walk.
+
+        Parameters
+        ----------
+        stays
+            The mean of the piecewise constant part at sample k as a share of its value at
+            sample k - 1, shape (...).
+
+        Returns
+        -------
+        F : Array
+            The state transition matrix, shape (..., size, size).
+        E : Array
+            The effects of v(k) on the state, shape (..., size, 3).
+        """
+        F_noise, g = self.state_space()
+        size = len(g) + 2
+        F = np.zeros((*self.load.shape, size, size))
+        F[..., :LOAD_STEPS, :LOAD_STEPS] = F_noise
+        F[..., LOAD_STEPS, LOAD_STEPS] = stays
+        F[..., LOAD_WALK, LOAD_WALK] = 1.0
+        F[..., 0, LOAD_STEPS] = self.load * stays
+        F[..., 0, LOAD_WALK] = self.load
+        E = np.zeros((*self.load.shape, size, 3))
+        E[..., :LOAD_STEPS, 0] = g
+        E[..., 0, 1:] = self.load[..., np.newaxis]
+        E[..., LOAD_STEPS, 1] = 1.0
+        E[..., LOAD_WALK, 2] = 1.0
+        return F, E
 
 
 def nominal(parameters: Parameters) -> LinearModel:
     """Return the model of the nominal plant, which is in the middle of all ranges of arguments.
 
-    `parameters` are the arguments of the environment. If the plant drifts, the model is that of
-    the sample k = 0.
+    `parameters` are the arguments of the environment. The model holds at the sample k = 0.
     """
     middle = {name: sum(parameters.range_of(name)) / 2 for name in PLANT_NUMBERS}
     return LinearModel(parameters, PlantNumbers(**middle), 0)
@@ -169,12 +220,12 @@ def nominal(parameters: Parameters) -> LinearModel:
 def step_test(parameters: Parameters) -> dict[str, float]:
     """Return the gain, time constant and delay that an engineer reads off a step response.
 
-    The flow steps on the nominal plant, without noise. With the times t_28 and t_63 at which
-    the temperature has made 28.3 % and 63.2 % of its change, the time constant is
-    T = 1.5 (t_63 - t_28), and the delay is t_63 - T (C. L. Smith, "Digital Computer Process
-    Control", 1972). As if read off a chart, the gain is rounded to four digits, the time
-    constant to three digits, and the delay to a whole number of samples. The delay is the time
-    from a flow to the first output that the flow can affect.
+    The step response is the temperature of the nominal plant after a step of the flow, without
+    noise. With the times t_28 and t_63 at which the temperature has made 28.3 % and 63.2 % of
+    its change, the time constant is T = 1.5 (t_63 - t_28), and the delay is t_63 - T (C. L.
+    Smith, "Digital Computer Process Control", 1972). As if read off a chart, the gain is
+    rounded to four digits, the time constant to three digits, and the delay to a whole number
+    of samples. The delay is the time from a flow to the first output that the flow can affect.
 
     Parameters
     ----------
@@ -194,16 +245,15 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     """
     plant = nominal(parameters)
     interval = parameters.sampling_interval
-    slowest_pole = float(np.abs(np.roots([1.0, *-plant.alpha])).max(initial=0.0))
-    if slowest_pole > SLOWEST_POLE:
+    if plant.slowest_pole > SLOWEST_POLE:
         raise ValueError(f"a must be of a stable plant for a step test, got {parameters.a}")
     if plant.gain == 0.0:
         raise ValueError(f"b must have a sum other than 0 for a gain, got {parameters.b}")
-    settling = 0.0  # samples
-    if slowest_pole:
-        settling = math.log(TRANSIENT) / math.log(slowest_pole)
+    settling_time = 0.0  # samples
+    if plant.slowest_pole > 0.0:
+        settling_time = math.log(REMAINING_TRANSIENT) / math.log(plant.slowest_pole)
     # Twice as long, as transients of repeated poles last longer.
-    samples = len(parameters.b) + 2 * math.ceil(settling) + 2
+    samples = len(parameters.b) + 2 * math.ceil(settling_time) + 2
     # The response begins with the last sample at which the output stands still.
     response = np.append(0.0, plant.impulse_response(samples).cumsum())
     response /= response[-1]
@@ -220,10 +270,10 @@ def step_test(parameters: Parameters) -> dict[str, float]:
 
 
 def _time_of(level: float, response: Array) -> float:
-    """Return the time at which a step response first reaches `level`, in samples.
+    """Return the time at which a step response first reaches a level, in samples.
 
-    `response` has the step response at the samples 0, 1, ..., and begins below `level`. The
-    time is found by linear interpolation between two samples.
+    `response` has the step response at the samples 0, 1, ..., in the unit of `level`, and
+    begins below `level`. The response is interpolated linearly between samples.
     """
     k = int(np.argmax(response >= level))
     share = (level - response[k - 1]) / (response[k] - response[k - 1])
@@ -231,7 +281,7 @@ def _time_of(level: float, response: Array) -> float:
 
 
 class LinearController(Protocol):
-    """A controller that is linear for commands outside the dead zone and within the limits."""
+    """A controller that is linear while its commands pass the dead zone and the limits."""
 
     def transfer(self) -> tuple[Array, Array]:
         """Return the transfer function from the error e (degC) to the command u (t/h).
@@ -247,28 +297,24 @@ class LinearLoop:
 
     Attributes
     ----------
-    controller : tuple of Array
-        Numerator and denominator of the transfer function from the error e (degC) to the
-        command u (t/h): coefficients of z^0, z^-1 and so on.
-    plant : tuple of Array
-        Numerator and denominator of the transfer function from u to the temperature y (degC)
-        without the delay: the polynomials B and A of equation (28) of the paper, as
-        coefficients of z^0, z^-1 and so on.
+    numerator, denominator : Array
+        The transfer function from the error e (degC) to the temperature y (degC), without the
+        delay of the plant: coefficients of z^0, z^-1 and so on.
     delay : int
-        The delay d of equation (28), samples.
+        The delay d of the plant, equation (28) of the paper, samples.
     """
 
-    controller: tuple[Array, Array]
-    plant: tuple[Array, Array]
+    numerator: Array
+    denominator: Array
     delay: int
 
     @classmethod
     def of(cls, controller: LinearController, plant: LinearModel) -> "LinearLoop":
         """Return the closed loop of `controller` and `plant`, which must be a single plant."""
-        numerator = np.append(0.0, plant.beta)
-        denominator = np.append(1.0, -plant.alpha)
-        delay = round(plant.numbers.delay)
-        return cls(controller.transfer(), (numerator, denominator), delay)
+        controller_numerator, controller_denominator = controller.transfer()
+        numerator = np.convolve(controller_numerator, np.append(0.0, plant.beta))
+        denominator = np.convolve(controller_denominator, np.append(1.0, -plant.alpha))
+        return cls(numerator, denominator, round(plant.numbers.delay))
 
     def characteristic(self, delay: int) -> Array:
         """Return the characteristic polynomial of the loop for any delay of the plant.
@@ -277,13 +323,11 @@ class LinearLoop:
         the values of z at which the polynomial is 0. `delay` is the delay d of the plant,
         samples.
         """
-        numerator, denominator = self.controller
-        b, a = self.plant
-        forward = np.append(np.zeros(delay), np.convolve(numerator, b))
-        return np.asarray(polyadd(np.convolve(denominator, a), forward), np.float64)
+        delayed_numerator = np.append(np.zeros(delay), self.numerator)
+        return np.asarray(polyadd(self.denominator, delayed_numerator), np.float64)
 
     def largest_pole(self) -> float:
-        """Return the largest modulus of a pole of the loop; below 1, the loop is stable."""
+        """Return the largest magnitude of a pole of the loop; below 1, the loop is stable."""
         return float(np.abs(np.roots(self.characteristic(self.delay))).max())
 
     def is_stable(self, delay: int) -> bool:
@@ -293,8 +337,9 @@ class LinearLoop:
         while z^-1 goes around the unit circle once, the characteristic polynomial turns about 0
         once for each pole outside the circle.
         """
+        # The values of the characteristic polynomial at equidistant points on the circle.
         values = np.fft.fft(self.characteristic(delay), CIRCLE_POINTS)
-        if not values.all():  # a pole on the circle
+        if not values.all():  # A pole lies on the circle.
             return False
         turns = np.angle(np.roll(values, -1) / values).sum() / (2.0 * math.pi)
         return bool(round(turns) == 0)
@@ -303,23 +348,22 @@ class LinearLoop:
         """Return the maximum sensitivity Ms of the loop; infinite for an unstable loop.
 
         Ms is the largest magnitude of the sensitivity function 1 / (1 + L) over the
-        `FREQUENCIES`, where L is the open loop of controller and plant.
+        `FREQUENCIES`, where L is the transfer function from the error to the temperature.
         """
         if not self.is_stable(self.delay):
             return math.inf
         inverse_z = np.exp(-1j * FREQUENCIES)
-        open_loop = np.convolve(self.controller[1], self.plant[1])
-        closed_loop = self.characteristic(self.delay)
-        ratio = polyval(inverse_z, open_loop) / polyval(inverse_z, closed_loop)
-        return float(np.abs(ratio).max())
+        characteristic = self.characteristic(self.delay)
+        sensitivity = polyval(inverse_z, self.denominator) / polyval(inverse_z, characteristic)
+        return float(np.abs(sensitivity).max())
 
     def stable_delays(self) -> tuple[int, int] | None:
         """Return the shortest and the longest delay of the plant with which the loop is stable.
 
-        The delays are values of the delay d of equation (28) of the paper, samples. The loop is
-        stable with all delays between the two, among which is the plant's own delay. Delays
-        above `LONGEST_DELAY` are not examined. The result is None if the loop is unstable with
-        the plant's own delay.
+        The delays d of equation (28) of the paper are counted in samples. The loop is stable
+        with all delays from the shortest to the longest, and one of these is the delay of the
+        plant. Delays above `LONGEST_DELAY` are not examined. The result is None if the loop is
+        unstable with the delay of the plant.
         """
         if not self.is_stable(self.delay):
             return None
@@ -338,10 +382,10 @@ def time_constant_for(
     slowest: float,
     fastest: float,
 ) -> float:
-    """Return the smallest time constant with which a loop is robust enough, s.
+    """Return the smallest time constant of a controller with which a loop is robust enough, s.
 
-    A loop is robust enough if Ms, its maximum sensitivity, is at most `target`. All larger time
-    constants that were tried make the loop robust enough, too.
+    A loop is robust enough if Ms, its maximum sensitivity, is at most `target`. The loop is
+    robust enough with all larger time constants that were tried, too.
 
     Parameters
     ----------
@@ -365,16 +409,15 @@ def time_constant_for(
     def meets_target(time_constant: float) -> bool:
         return LinearLoop.of(make(time_constant), plant).sensitivity() <= target
 
-    grid: list[float] = np.geomspace(slowest, fastest, GRID).tolist()
-    meets = [meets_target(time_constant) for time_constant in grid]
-    if all(meets):
-        return fastest
-    first_miss = meets.index(False)
-    if first_miss == 0:
+    tried: list[float] = np.geomspace(slowest, fastest, TIME_CONSTANTS_TRIED).tolist()
+    robust = list(itertools.takewhile(meets_target, tried))
+    if not robust:
         raise ValueError(
             f"no time constant up to {slowest:g} s gives the loop an Ms of {target:g} or less"
         )
-    slow, fast = grid[first_miss - 1], grid[first_miss]
+    if len(robust) == len(tried):
+        return fastest
+    slow, fast = robust[-1], tried[len(robust)]
     while slow / fast > 1.0 + PRECISION:
         middle = math.sqrt(slow * fast)
         if meets_target(middle):

@@ -20,9 +20,9 @@ Array = NDArray[np.float64]
 # Largest error of a settled output, divided by the set-point change (in `measure`) or by the
 # set point (in `settled`).
 SETTLING_BAND = 0.05
-START = 300  # samples that count as the start of a run: half a period of the square wave
-CHANGE = 60  # samples after a set-point change that count as the response to the change
-LAST = 50  # samples at the end of a run whose errors decide whether the output has settled
+START_SAMPLES = 300  # that count as the start of a run: half a period of the square wave
+RESPONSE_SAMPLES = 60  # after a set-point change that count as the response to the change
+LAST_SAMPLES = 50  # of a run, whose errors decide whether the output has settled
 
 
 class Agent(Protocol):
@@ -39,7 +39,7 @@ class Agent(Protocol):
 
 
 class IdleValve:
-    """A controller that keeps the flow at 0 t/h, for comparison with other controllers.
+    """A controller that keeps the flow at 0 t/h.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class IdleValve:
         self.action = np.reshape(action_from_command(0.0, u_min, u_max), (-1, 1))
 
     def reset(self) -> None:
-        """Prepare for a new episode: an idle valve has nothing to forget."""
+        """Do nothing, since an idle valve has nothing to forget."""
 
     def act(self, observation: NDArray[np.float32]) -> Array:
         """Return the actions that keep the flow at 0 t/h, shape (runs, 1)."""
@@ -87,8 +87,8 @@ def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vect
 def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[Array]:
     """Return the plant numbers that the environment draws for the runs of a batch.
 
-    Each plant number, such as the delay, is an array of shape (runs,), also if it is the same
-    in all runs.
+    Each plant number, such as the delay, is an array of shape (runs,), even if all runs have
+    the same number.
 
     Parameters
     ----------
@@ -110,15 +110,12 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
 
 
 def is_random(parameters: Parameters) -> bool:
-    """Return whether the environment uses random numbers, so that episodes differ.
-
-    The random numbers can be those of the noise, the load, the set point or the plant.
-    """
-    _, largest_noise = parameters.range_of("noise_variance")
-    _, largest_measurement_noise = parameters.range_of("measurement_noise_variance")
+    """Return whether noise, load, set points or plant are random, so that episodes differ."""
+    _, largest_noise_variance = parameters.range_of("noise_variance")
+    _, largest_reading_variance = parameters.range_of("measurement_noise_variance")
     return (
-        largest_noise > 0.0
-        or largest_measurement_noise > 0.0
+        largest_noise_variance > 0.0
+        or largest_reading_variance > 0.0
         or parameters.is_disturbed
         or parameters.setpoint == "random"
         or bool(parameters.ranges)
@@ -157,13 +154,14 @@ def rollout(
         return agent.act(observations)
 
     agent.reset()
-    seeds = [*range(seed, seed + plants.num_envs)]
+    seeds = list(range(seed, seed + plants.num_envs))
     signals = []
     steps = run_batch(plants, act, samples, seeds)
     for sample, next_sample in itertools.pairwise(steps):
         info = sample.infos
         next_info = next_sample.infos
-        # A step reports the command and the applied flow of the sample at which it starts.
+        # In the order of the fields of `Trajectory`. The infos after a step have the command
+        # and the applied flow of the sample at which the step started.
         signals_of_sample = [
             info["setpoint"],
             info["output"],
@@ -184,13 +182,13 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
 
     - `mae`: mean of |e(k)|, degC;
     - `mae_start`, `mae_changes`, `mae_steady`: the contributions of three parts of the run to
-      `mae`, degC: of the samples before `START`, of the later samples that lie less than
-      `CHANGE` samples after a change of the set point, and of the remaining samples;
+      `mae`, degC: of the first `START_SAMPLES` samples, of the later samples that lie less
+      than `RESPONSE_SAMPLES` samples after a set-point change, and of the remaining samples;
     - `ise`: integral of e^2 over time, degC^2 min;
     - `itae`: integral of t |e| over time, degC min^2, where t is the time since the latest
       set-point change;
-    - `total_variation`: valve travel, the sum of all changes of the applied flow, t/h, the
-      first of them from 0 t/h;
+    - `total_variation`: valve travel, the sum of the magnitudes of all changes of the applied
+      flow, t/h, including the first change from 0 t/h;
     - `overshoot`: largest distance of the output beyond a new set point, in percent of the
       set-point change; the maximum over all changes;
     - `settling_time`: time from a set-point change until the error stays within `SETTLING_BAND`
@@ -203,7 +201,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """
     interval = parameters.sampling_interval / 60.0  # min
     errors = np.abs(trajectory.next_error)
-    steps = [
+    step_measures = [
         _measure_steps(setpoint, output)
         for setpoint, output in zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
     ]
@@ -212,10 +210,10 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
         "mae": mean_error(trajectory),
         **_parts_of_error(trajectory),
         "ise": interval * np.square(errors).sum(axis=0),
-        "itae": interval**2 * np.array([step.itae for step in steps]),
+        "itae": interval**2 * np.array([run.itae for run in step_measures]),
         "total_variation": np.abs(moves).sum(axis=0),
-        "overshoot": 100.0 * np.array([step.overshoot for step in steps]),
-        "settling_time": interval * np.array([step.settling for step in steps]),
+        "overshoot": 100.0 * np.array([run.overshoot for run in step_measures]),
+        "settling_time": interval * np.array([run.settling_time for run in step_measures]),
         **_actuator_shares(trajectory.command, parameters),
     }
 
@@ -228,13 +226,16 @@ def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
     errors = np.abs(trajectory.next_error)
     k = np.arange(1, len(errors) + 1)[:, np.newaxis]
     setpoint_moves = np.diff(trajectory.next_setpoint, axis=0, prepend=trajectory.setpoint[:1])
-    latest_change = np.maximum.accumulate(np.where(setpoint_moves != 0.0, k, -CHANGE), axis=0)
-    is_start = k < START
-    is_change = k < latest_change + CHANGE
+    # The sample of the latest set-point change; so long ago, if there was none, that no sample
+    # belongs to its response.
+    changes = np.where(setpoint_moves != 0.0, k, -RESPONSE_SAMPLES)
+    latest_change = np.maximum.accumulate(changes, axis=0)
+    is_start = k < START_SAMPLES
+    is_response = k < latest_change + RESPONSE_SAMPLES
     return {
         "mae_start": (errors * is_start).mean(axis=0),
-        "mae_changes": (errors * (~is_start & is_change)).mean(axis=0),
-        "mae_steady": (errors * (~is_start & ~is_change)).mean(axis=0),
+        "mae_changes": (errors * (~is_start & is_response)).mean(axis=0),
+        "mae_steady": (errors * (~is_start & ~is_response)).mean(axis=0),
     }
 
 
@@ -258,55 +259,55 @@ def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]
     }
 
 
-class _Steps(NamedTuple):
-    """Measures of one run that are counted from the latest set-point change; see `measure`."""
+class _StepMeasures(NamedTuple):
+    """Measures of one run that count time from the latest set-point change; see `measure`."""
 
     itae: float  # integral of time times |error|, degC samples^2
     overshoot: float  # largest overshoot, divided by the set-point change
-    settling: float  # longest settling time, samples; infinite if the output does not settle
+    settling_time: float  # the longest, samples; infinite if the output does not settle
 
 
-def _measure_steps(setpoint: Array, output: Array) -> _Steps:
-    """Return the measures of one run that are counted from the latest set-point change.
+def _measure_steps(setpoint: Array, output: Array) -> _StepMeasures:
+    """Return the measures of one run that count time from the latest set-point change.
 
     `setpoint` and `output` have the set point and the temperature, degC, shape (samples,).
     """
     itae = 0.0
     overshoot = 0.0
-    settling = 0.0
+    settling_time = 0.0
     previous_setpoint = 0.0  # before k = 0
     for start, stop in held(setpoint):
         errors = setpoint[start:stop] - output[start:stop]
         itae += float(np.arange(stop - start) @ np.abs(errors))
         change = setpoint[start] - previous_setpoint
         previous_setpoint = setpoint[start]
-        if change == 0.0:  # a run that begins at set point 0
+        if change == 0.0:  # The run begins at set point 0.
             continue
         overshoot = max(overshoot, float(np.max(-errors / change)))
         outside = np.flatnonzero(np.abs(errors) > SETTLING_BAND * abs(change))
         if len(outside) == 0:
             continue
-        if outside[-1] == stop - start - 1:  # not settled at the end
-            settling = math.inf
-        settling = max(settling, float(outside[-1] + 1))
-    return _Steps(itae, overshoot, settling)
+        samples_outside = float(outside[-1] + 1)
+        if samples_outside == stop - start:  # The output has not settled at the end.
+            samples_outside = math.inf
+        settling_time = max(settling_time, samples_outside)
+    return _StepMeasures(itae, overshoot, settling_time)
 
 
 def held(setpoint: Array) -> list[tuple[int, int]]:
-    """Return the stretches of one run in which the set point is constant.
+    """Return the first sample and the end of each stretch with a constant set point.
 
     A stretch (start, stop) consists of the samples k = start to stop - 1. `setpoint` has the
-    set point of the run, degC, shape (samples,).
+    set point of one run, degC, shape (samples,).
     """
     changes = np.flatnonzero(np.diff(setpoint)) + 1
     return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
 
 
 def mean_error(trajectory: Trajectory) -> Array:
-    """Return the mean absolute error of each run in `trajectory`, degC, shape (runs,).
+    """Return the mean absolute error of each run, degC, shape (runs,).
 
-    The mean is over the samples k = 1 to N: the error at k = 0 does not depend on the
-    controller.
+    The mean is over the samples k = 1 to N, as no controller changes the error at k = 0.
     """
     return np.asarray(np.abs(trajectory.next_error).mean(axis=0))
 
@@ -314,10 +315,10 @@ def mean_error(trajectory: Trajectory) -> Array:
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
     """Return whether the output of each run has settled at the end of the run, shape (runs,).
 
-    The output has settled if the last `LAST` errors of the run are all within `SETTLING_BAND`
-    times the set point.
+    The output has settled if each of the last `LAST_SAMPLES` errors of the run is at most
+    `SETTLING_BAND` times the set point.
     """
-    setpoint = trajectory.setpoint[-LAST:]
-    output = trajectory.output[-LAST:]
+    setpoint = trajectory.setpoint[-LAST_SAMPLES:]
+    output = trajectory.output[-LAST_SAMPLES:]
     is_within = np.abs(setpoint - output) <= SETTLING_BAND * np.abs(setpoint)
     return np.asarray(is_within.all(axis=0))

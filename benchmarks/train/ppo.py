@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
 from agents import Increments, PolicyNetwork
-from benchmarks.controllers.plant_scale import scales
+from benchmarks.controllers.plant_scale import scale_of
 from benchmarks.controllers.spec import LIMITS, knowledge
 from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
 from benchmarks.lib.provenance import versions
@@ -130,8 +130,9 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
     }
     noisy = dict(training)
     if parameters.range_of("noise_variance")[1] == 0.0:
-        reach = "reach of half the flow's range, °C"
-        noisy["noise_variance"] = 0.6 * (scales(parameters)[reach] / scales(paper)[reach]) ** 2
+        scale, paper_scale = scale_of(parameters), scale_of(paper)
+        ratio = scale.temperature_range / paper_scale.temperature_range
+        noisy["noise_variance"] = 0.6 * ratio**2
     validation = {
         **plant,
         "setpoint": "square",

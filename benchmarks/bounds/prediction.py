@@ -1,0 +1,110 @@
+"""Compute how exactly the output of a plant can be predicted from the transmitter's readings.
+
+The Kalman filter gives the covariance of the state of a plant, given the readings so far, and
+from this covariance follows the variance of the best prediction.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.loop.linear import LinearModel
+
+Array = NDArray[np.float64]
+
+# Variance of the readings of a perfect transmitter, degC^2; 0 would divide by 0 in the filter.
+SMALLEST_VARIANCE = 1e-8
+
+
+def noise_variance(model: LinearModel) -> Array:
+    """Return the variance of the error with which an output y(k) without load is predicted.
+
+    The output y(k) is predicted as well as possible from the transmitter's readings up to
+    k - d - 1, where d is the plant's delay. The variances are in degC^2, shape (samples,), for
+    the samples k of `model`.
+    """
+    F, Q = noise_system(model)
+    return predicted_variance(noise_covariance(model), F, Q, model.lag)
+
+
+def noise_covariance(model: LinearModel) -> Array:
+    """Return the covariances of the state x(k) of a plant without load, given readings up to k.
+
+    `noise_system` describes the state. The covariances are 0 if the transmitter is perfect. The
+    covariances have the shape (samples, size, size), for the samples k of `model`.
+    """
+    F, Q = noise_system(model)
+    if model.numbers.measurement_noise_variance == 0.0:
+        return np.zeros_like(F)
+    return filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
+
+
+def noise_system(model: LinearModel) -> tuple[Array, Array]:
+    """Return F(k) and Q(k) of x(k) = F(k) x(k-1) + v(k), the effect of noise on a plant.
+
+    The state x(k) is the state of `LinearModel.state_space`, whose first element is the output
+    y(k), degC. The vector v(k) is white with the covariance Q(k). F and Q have the shape
+    (samples, size, size), for the samples k of `model`.
+    """
+    F, g = model.state_space()
+    covariance = model.numbers.noise_variance * np.outer(g, g)
+    return F, np.broadcast_to(covariance, F.shape)
+
+
+def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
+    """Return the covariances of the state x(k), given all readings up to k (Kalman filter).
+
+    Parameters
+    ----------
+    F, Q
+        x(k) = F(k) x(k-1) + v(k), where x(0) = 0 and v(k) is white with the covariance Q(k).
+        Both have the shape (samples, size, size).
+    reading_variance
+        A reading is the first element of x(k) plus white noise with this variance, degC^2.
+
+    Returns
+    -------
+    ndarray
+        Covariances of x(k), shape (samples, size, size).
+    """
+    filtered = np.zeros_like(F)
+    P = filtered[0]
+    for k in range(1, len(F)):
+        P = F[k] @ P @ F[k].T + Q[k]
+        innovation_variance = P[0, 0] + max(reading_variance, SMALLEST_VARIANCE)
+        P = P - np.outer(P[:, 0], P[0]) / innovation_variance
+        filtered[k] = P
+    return filtered
+
+
+def predicted_variance(filtered: Array, F: Array, Q: Array, lag: int) -> Array:
+    """Return the variance of the output y(k), given the readings up to k - lag, degC^2.
+
+    Parameters
+    ----------
+    filtered
+        Covariances of the state x(k), given the readings up to k, shape (samples, size, size).
+    F, Q
+        x(k) = F(k) x(k-1) + v(k), where v(k) is white with the covariance Q(k). The first
+        element of x(k) is y(k).
+    lag
+        Number of samples to predict ahead.
+
+    Returns
+    -------
+    ndarray
+        Variances of y(k), shape (samples,). For k below `lag`, y(k) is predicted from x(0),
+        which is known.
+    """
+    samples = len(F)
+    steps = min(lag, samples)
+    # The predictions of all outputs y(k) advance together, from `sample` = k - lag to k.
+    sample = np.arange(samples) - steps
+    P = filtered[np.maximum(sample, 0)]
+    for _ in range(steps):
+        sample = sample + 1
+        from_start = np.maximum(sample, 0)
+        advanced = F[from_start] @ P @ F[from_start].transpose(0, 2, 1) + Q[from_start]
+        has_begun = sample >= 1
+        P = np.where(has_begun[:, np.newaxis, np.newaxis], advanced, P)
+    # Rounding can leave a variance of 0 a little below it.
+    return np.maximum(P[:, 0, 0], 0.0)
