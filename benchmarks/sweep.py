@@ -308,20 +308,17 @@ def table(
     tables = [pd.DataFrame()]
     for i, plant in enumerate(plants):
         idle = results.get(f"plant {i}")
-        if idle is None:
-            continue
         for agent in agents:
             measures = results.get(f"plant {i}, {agent}")
-            if measures is None:
-                continue
-            comparisons = {
-                "limit": idle["least_possible"],
-                "ratio": measures["mae"] / idle["least_possible"],
-                "oscillates": measures["swing"] > idle["swing"] + OSCILLATES,
-                "useless": measures["mae"] >= idle["mae"],
-            }
-            columns = {"plant": i, "agent": agent, **measures, **comparisons, **plant}
-            tables.append(pd.DataFrame(columns))
+            if idle and measures:
+                comparisons = {
+                    "limit": idle["least_possible"],
+                    "ratio": measures["mae"] / idle["least_possible"],
+                    "oscillates": measures["swing"] > idle["swing"] + OSCILLATES,
+                    "useless": measures["mae"] >= idle["mae"],
+                }
+                columns = {"plant": i, "agent": agent, **measures, **comparisons, **plant}
+                tables.append(pd.DataFrame(columns))
     return pd.concat(tables, ignore_index=True)
 
 

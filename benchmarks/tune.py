@@ -144,8 +144,8 @@ def work(options: Options) -> str:
         }
         write_json(folder / "gains.json", content)
         title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS:,} new runs"
-        best = Section(title, [NOTE, FINALS_NOTE], in_text(finalists))
-        fixed = Section("Gains before this search", [FIXED_NOTE], in_text(others(name, plant)))
+        best = Section(title, [NOTE, FINALS_NOTE], finalists.map("{:.4g}".format))
+        fixed = Section("Gains before this search", [FIXED_NOTE], fixed_gains(name, plant))
         write_report(folder, f"Gains: {ROSTER[name].label}", [best, fixed], provenance)
     words = [*options.plant.words(), "--agent", f"my-{name}={target}/gains.json"]
     return (
@@ -153,12 +153,6 @@ def work(options: Options) -> str:
         "The following command compares the best gains with other controllers: python -m "
         f"benchmarks.compare {shlex.join(words)}"
     )
-
-
-def in_text(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with its numbers as texts of four significant digits."""
-    numbers = table.select_dtypes("number")
-    return table.astype(object).assign(**numbers.map("{:.4g}".format))
 
 
 def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
@@ -192,28 +186,23 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
     return table.sort_values("objective", ignore_index=True)
 
 
-def others(name: str, plant: Arguments) -> pd.DataFrame:
-    """Score the gains in `FIXED_GAINS` on the new runs, and return a row for each controller.
+def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
+    """Score the gains of `FIXED_GAINS` on new runs, and return a table of texts.
 
-    A row has the label of the controller, the origin of its gains, the gains, and the
-    objective, degC.
-
-    Parameters
-    ----------
-    name
-        Name of the controller whose gains were searched.
-    plant
-        Arguments of the environment for the plant of the search.
+    A row has the label of a controller, the origin of its gains, the gains, and the objective,
+    degC. `name` is the name of the controller whose gains were searched, and `plant` has the
+    arguments of the environment for the plant of the search.
     """
     import pandas as pd
 
     rows = []
-    for other, source in FIXED_GAINS[name].items():
+    for other, origin_of_gains in FIXED_GAINS[name].items():
         controller = ROSTER[other].make(plant, 1, 0)
         gains = {gain: getattr(controller, gain) for gain in spans_of(name, plant)}
         objective = score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, gains)["objective"]
-        label = ROSTER[other].label
-        rows.append({"controller": label, "origin": source, **gains, "objective": objective})
+        numbers = {**gains, "objective": objective}
+        row = {"controller": ROSTER[other].label, "origin": origin_of_gains}
+        rows.append(row | {key: f"{number:.4g}" for key, number in numbers.items()})
     return pd.DataFrame(rows)
 
 

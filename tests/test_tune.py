@@ -191,10 +191,10 @@ def test_controllers_of_other_commands_have_the_gains_of_a_search(name, monkeypa
     monkeypatch.setattr(tune, "FINAL_RUNS", 2)
     constant = {"constant": tune.TuningCase(300, 0, {"setpoint": 4.8})}
     monkeypatch.setattr(tune, "CASES", constant)
-    table = tune.others(name, {})
+    table = tune.fixed_gains(name, {})
     for other, objective in zip(tune.FIXED_GAINS[name], table["objective"], strict=True):
         case = tune.cases({})["constant"]
         trajectory = ROSTER[other].run(case.arguments, 300, 2, tune.FINAL_FIRST_RUN)
         unsettled = 1.0 - tune.settled(trajectory).mean()
         error = np.median(tune.mean_error(trajectory))
-        assert objective == pytest.approx(error + 5.0 * unsettled, rel=1e-12)
+        assert float(objective) == pytest.approx(error + 5.0 * unsettled, rel=1e-3)
