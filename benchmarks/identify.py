@@ -196,6 +196,11 @@ def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
     has_mark = column.str.contains(f"[{marks}]", na=False)
     marked = column[has_mark]
     looks_like_thousands = bool(has_mark.any() and marked.str.fullmatch(THOUSANDS).all())
+    if separator != ",":
+        # The mark may well be a decimal mark. But if it separates thousands, and is read as a
+        # decimal mark, then the largest numbers of the column become the smallest.
+        sizes = numbers.abs()
+        looks_like_thousands &= bool(sizes[has_mark].max() < sizes[~has_mark].min())
     if looks_like_thousands:
         raise UsageError(
             f"line {marked.index[0] + 2}: {column.name} looks like thousands: "

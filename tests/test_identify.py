@@ -94,7 +94,11 @@ class TestFit:
 
 
 def table(line="16,5,1", mark=".", start=0):
-    """Return the text of a log whose line 4 is this one, and whose other flows are 3."""
+    """Return the text of a log whose line 4 is `line`, and whose other flows are 3.
+
+    `start` is the time of the first row, in seconds or as a `numpy.datetime64`. `mark` is the
+    decimal mark of the temperatures.
+    """
     rows = [f"{start + 8 * k},3,{k % 7}{mark}25" for k in range(120)]
     return "\n".join(["time,flow,temperature", *rows[:2], line, *rows[3:]])
 
@@ -128,6 +132,17 @@ class TestLog:
         log = read(WAYS[way], tmp_path)
         assert log.flow[:4].tolist() == [3.0, 3.0, 5.0, 3.0]
         assert log.temperature[[0, 2, 3, 8, 9]].tolist() == [0.25, 1.0, 3.25, 1.25, 2.25]
+
+    @pytest.mark.parametrize("separator", [";", "\t"])
+    @pytest.mark.parametrize("mark", [".", ","])
+    def test_three_decimals_are_not_taken_for_thousands(self, separator, mark, tmp_path):
+        rows = [("time", "flow", "temperature")]
+        for k in range(120):
+            flow = ("480", f"485{mark}125")[k % 2]
+            rows.append((str(8 * k), flow, f"38{k % 7}{mark}250"))
+        log = read("\n".join(map(separator.join, rows)), tmp_path)
+        assert log.flow[:3].tolist() == [480.0, 485.125, 480.0]
+        assert log.temperature[:3].tolist() == [380.25, 381.25, 382.25]
 
     @pytest.mark.parametrize("complaint", REFUSED)
     def test_what_cannot_be_used_is_named(self, complaint, tmp_path):
