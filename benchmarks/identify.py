@@ -30,6 +30,8 @@ MOST_MISSING = 0.2  # largest share of the values of a column that may be missin
 # Matches one to three digits and then groups of three digits, each behind a point or a comma.
 # The comma in 1,480 may be a decimal mark, or may separate thousands.
 THOUSANDS = r"[+-]?[1-9]\d{0,2}([.,]\d{3})+"
+# Finds the second number of a date such as 31.12.2025, 31/12/2025 or 12/31/2025.
+SECOND_OF_DATE = r"^\d{1,2}[./-](\d{1,2})[./-]"
 CAPTION = "The log as it was recorded, and as the model simulates it from the flow"
 
 
@@ -227,8 +229,11 @@ def read_times(column: pd.Series[str], separator: str) -> NDArray[np.float64]:
     else:
         is_iso = str(column.iloc[0])[:4].isdigit()  # ISO 8601 begins with the year
         form: Any = "ISO8601" if is_iso else "mixed"
+        # Other dates begin with the day, unless a second number is too large for a month.
+        second_numbers = column.str.extract(SECOND_OF_DATE, expand=False).astype(np.float64)
+        day_first = not is_iso and not (second_numbers > 12.0).any()
         dates = pd.to_datetime(
-            column, errors="coerce", utc=True, format=form, dayfirst=not is_iso
+            column, errors="coerce", utc=True, format=form, dayfirst=day_first
         )
         times = (dates - dates.iloc[0]).dt.total_seconds()
     refuse(column, times.isna(), "a number or a date, such as 2025-12-31 12:00")
@@ -261,7 +266,10 @@ def sample_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float
     samples = np.round(exact_samples)
     is_irregular = np.abs(exact_samples - samples)[1:] > 0.4
     is_irregular |= np.diff(samples) < 1.0  # two rows in one sample
-    gap = "rows are missing before it. Divide the log there."
+    gap = (
+        "rows are missing before it. Divide the log there. If the dates begin with the month, "
+        "write dates such as 2025-12-31"
+    )
     for is_bad, advice in (
         (steps <= 0.0, "times must increase. Sort the rows, and remove repeated ones"),
         (steps > LONGEST_GAP * interval, gap),

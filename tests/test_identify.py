@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from datetime import datetime, timedelta
 from functools import cache
 
 import gymnasium
@@ -103,6 +104,16 @@ def table(line="16,5,1", mark=".", start=0):
     return "\n".join(["time,flow,temperature", *rows[:2], line, *rows[3:]])
 
 
+def dated(form, first):
+    """Return the text of a log with dates, of the form for `strftime`, from `first` on."""
+    days = datetime.strptime(first, form)
+    rows = []
+    for k, row in enumerate(table().splitlines()[1:]):
+        date = (days + timedelta(seconds=8 * k)).strftime(form)
+        rows.append(date + row[row.index(",") :])
+    return "\n".join(["time,flow,temperature", *rows])
+
+
 def read(text, folder):
     (folder / "log.csv").write_text(text)
     return read_log(Options(folder / "log.csv"))
@@ -111,12 +122,17 @@ def read(text, folder):
 WAYS = {
     "decimal commas": table(mark="|").replace(",", ";").replace("|", ","),
     "dates": table("2026-02-01T00:00:15,5,1", start=np.datetime64("2026-01-31T23:59:59")),
+    "dates that begin with the day": dated("%d.%m.%Y %H:%M:%S", "31.12.2025 23:59:00"),
+    "dates that begin with the month": dated("%m/%d/%Y %H:%M:%S", "01/12/2026 23:59:00"),
     "a missing row": table().replace("\n64,3,1.25", ""),
 }
 REFUSED = {
     "line 4: flow looks like thousands: '1,480'": table('16,"1,480" ,1'),
     "line 4: flow looks like thousands: '1.480'": table("16,1.480,1").replace(",", ";"),
     "line 4: a time step of 11.6 s: most time steps are 8": table("19.6,5,1"),
+    "line 10: .* dates begin with the month, write .* 2025-12-31": (
+        dated("%m/%d/%Y %H:%M:%S", "01/02/2026 23:59:00")
+    ),
 }
 # How the temperature of a log becomes one that asks for a warning, by words of the warning.
 DOUBTS = {
