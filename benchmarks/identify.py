@@ -188,7 +188,7 @@ def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
     """Return the numbers of a column of texts, with NaN for empty cells.
 
     A `UsageError` names the line of the first text that is not a number, or that looks like
-    thousands. `separator` is the separator of the table's columns.
+    thousands. `separator` is the mark between the columns of the file.
     """
     import pandas as pd
 
@@ -219,7 +219,8 @@ def read_times(column: pd.Series[str], separator: str) -> NDArray[np.float64]:
     """Return the times of a column of numbers (s) or dates, in seconds, shape (rows,).
 
     Dates become seconds since the first row. A `UsageError` names the line of the first text
-    that is neither a number nor a date. `separator` is the separator of the table's columns.
+    that is neither a number nor a date. `separator` is the mark between the columns of the
+    file.
     """
     import pandas as pd
 
@@ -253,11 +254,12 @@ def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> Non
 
 
 def sample_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
-    """Return the number of the sample in each row, from 0 on, and the sampling interval, s.
+    """Return the sample number of each row, counted from 0, and the sampling interval, s.
 
-    A number is left out where a row is missing. `times` has the times of the rows, s, shape
-    (rows,). A `UsageError` is raised if times do not increase, if a row comes more than 0.4
-    sampling intervals early or late, or if 20 or more rows in succession are missing.
+    Where rows are missing, sample numbers are left out. `times` has the times of the rows, s,
+    and has the shape of the sample numbers, (rows,). A `UsageError` is raised if times do not
+    increase, if a row comes more than 0.4 sampling intervals early or late, or if 20 or more
+    rows in succession are missing.
     """
     steps = np.diff(times)
     is_usual = np.abs(steps / np.median(steps) - 1.0) < 0.5
@@ -305,7 +307,7 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
             "The prediction errors are not white noise: the plant or its disturbances are not "
             "of the model's form, and the intervals are too narrow."
         )
-    if len(fit.zones) == 2:
+    if len(fit.zones) == 2:  # as `possible_zones` returns them for such a flow
         sentences.append("The flow had fewer than three values: no dead zone can be found.")
     if intervals.low["gain"] <= 0.0 <= intervals.high["gain"]:
         sentences.append("The interval of the gain holds 0: the sign of the gain is unknown.")
@@ -313,10 +315,10 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
 
 
 def is_white(errors: NDArray[np.float64]) -> bool:
-    """Return whether errors, shape (blocks,), look like white noise.
+    """Return whether prediction errors, shape (blocks,), look like white noise.
 
-    They do if at most a quarter of the autocorrelations at lags from 1 to 30 blocks are larger
-    than chance explains.
+    Errors look like white noise if at most a quarter of their autocorrelations, at lags from 1
+    to 30 blocks, are larger than chance explains.
     """
     correlations = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
     is_large = np.abs(correlations) > max(0.1, 2.5 / np.sqrt(len(errors)))
@@ -465,13 +467,10 @@ def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
 
     `intervals` is the table of `benchmarks.loop.identification.estimates`.
     """
-    import pandas as pd
-
-    rows = []
-    for name, (value, low, high) in intervals.iterrows():
-        label = str(name).replace("_", " ")
-        rows.append((label, f"{value:.4g}", f"[{low:.4g}, {high:.4g}]"))
-    return pd.DataFrame(rows, columns=["", "value", "95 % interval"])
+    texts = intervals.map("{:.4g}".format)
+    texts["95 % interval"] = "[" + texts.low + ", " + texts.high + "]"
+    texts.insert(0, "", texts.index.str.replace("_", " "))
+    return texts.drop(columns=["low", "high"])
 
 
 def draw(fit: Fit, title: str, path: Path) -> None:

@@ -28,15 +28,16 @@ Array = NDArray[np.float64]
 
 # A second lag, a dead zone and a load step become part of the model only if they improve the
 # fit by these values of `Fit.improvement`, because any part improves a fit a little by chance.
-SECOND_LAG = 10.0
-DEAD_ZONE = 9.0
-LOAD_STEP = 25.0  # the largest, because the time of a step is chosen among hundreds of times
+IMPROVEMENT_BY_SECOND_LAG = 10.0
+IMPROVEMENT_BY_DEAD_ZONE = 9.0
+# This value is the largest, because the time of a step is chosen among hundreds of times.
+IMPROVEMENT_BY_LOAD_STEP = 25.0
 MOST_LOAD_STEPS = 4  # in a model: with many steps, the model could fit any temperature
-# Standard errors are multiplied by this factor, because no plant is quite of the model's form.
-# With this factor, the 95 % intervals of the gain contained the true gain in at least 95 % of
-# the logs of simulated plants.
-SPREAD = 1.5
-GRID = 31  # number of centres, and number of half widths, of a dead zone that are tried
+# A 95 % interval is this number of standard errors wide on either side. Two standard errors
+# would be enough if a plant were exactly of the model's form. With three, the intervals of the
+# gain contained the true gain in at least 95 % of the logs of simulated plants.
+INTERVAL = 3.0
+GRID_POINTS = 31  # number of centres, and number of half widths, of a dead zone that are tried
 # The lags between a measured disturbance and the temperature are unknown. A weighted sum of the
 # step responses of three pairs of lags is close to nearly any smooth step response. Each pair
 # has the plant's larger time constant, and this time constant times one of the ratios.
@@ -151,8 +152,8 @@ class Unknowns(NamedTuple):
     def respond(self, flows: Array) -> Array:
         """Return the output of the delay and the lags, with gain 1, for changes of some flows.
 
-        A change is the difference of a flow from the flow in the first row, with which the
-        plant is taken to have been at rest. `flows` and the result have the shape (rows, ...).
+        A change is a flow minus the flow in the first row. `flows` and the result have the
+        shape (rows, ...).
         """
         return respond(flows - flows[0], self.delay, self.slow, self.fast)
 
@@ -263,11 +264,11 @@ class Fit:
         return float(self.errors @ self.errors + TINY)
 
     def improvement(self, squares: Array | float) -> Array:
-        """Return how much better than this fit other fits are: positive where they are better.
+        """Return by how much other fits are better than this fit; negative if they are worse.
 
-        The improvement is twice the logarithm of the ratio of the likelihoods of the other fit
-        and of this fit. `squares` has the sum of squared prediction errors of each other fit,
-        degC^2, and the result has the shape of `squares`.
+        The improvement is twice the logarithm of a ratio: the likelihood of the other fit,
+        divided by the likelihood of this fit. `squares` has the sum of squared prediction
+        errors of each other fit, degC^2, and the result has the shape of `squares`.
         """
         return np.asarray(len(self.errors) * np.log(self.squares / (squares + TINY)))
 
@@ -306,7 +307,7 @@ class Fit:
 
         The search starts from the unknowns of this fit and finds a local minimum of the sum of
         squared prediction errors. The result also has `standard_errors`. `evaluations` is the
-        largest number of steps of the search.
+        largest number of steps that the search may try.
         """
         longest_delay = len(self.log.flow) / 6.0
         highest = HIGHEST._replace(delay=longest_delay, log_slow=np.log(2.0 * longest_delay))
@@ -351,20 +352,20 @@ def possible_zones(
         The centre of the dead zone, t/h; None if the centre is unknown. For an unknown centre,
         the result has centres in the whole range of the flow.
     applied
-        Whether the flow was measured behind the valve. If it was, all half widths are 0.
+        Whether the flow was measured behind the valve, so that all half widths are 0.
     """
-    centres = np.linspace(flow.min(), flow.max(), GRID)
+    centres = np.linspace(flow.min(), flow.max(), GRID_POINTS)
     if operating_flow is not None:
         centres = np.array([operating_flow])
     widest = np.abs(flow - centres.mean()).max()
-    half_widths = np.linspace(0.0, widest, GRID)
+    half_widths = np.linspace(0.0, widest, GRID_POINTS)
     # Flows that differ by less than 2 % of their range count as equal.
     levels = np.unique(np.round(50.0 * (flow - flow.min()) / np.ptp(flow)))
     if len(levels) < 3:  # Two different flows cannot show how wide the dead zone is.
         half_widths = np.array([0.0, widest])
     if applied:
         half_widths = np.zeros(1)
-    if len(half_widths) < GRID:
+    if len(half_widths) < GRID_POINTS:
         centres = centres.mean(keepdims=True)
     return [DeadZone(centre, width) for width in half_widths for centre in centres]
 
@@ -389,6 +390,8 @@ def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
         start = start._replace(gain=float(gains[best]), delay=float(delays[best]))
         fits.append(replace(fit, unknowns=start).refined(12))
     fit = min(fits, key=lambda fit: fit.squares)
+    # After the delay, the temperature depends on the flows in the log. The margin allows for
+    # errors of the first fit.
     first_row = int(1.3 * fit.unknowns.delay + fit.unknowns.slow / 4.0) + 3
     return replace(fit, first_row=min(first_row, rows // 6))
 
@@ -409,14 +412,15 @@ def try_zones(fit: Fit) -> pd.DataFrame:
 
 
 def with_zone(fit: Fit) -> Fit:
-    """Return `fit` with a new dead zone, the mean of the likeliest ones among `fit.zones`.
+    """Return `fit` with a new dead zone: the mean of the likeliest dead zones in `fit.zones`.
 
-    If the best dead zone improves a fit without a dead zone by less than the constant
-    `DEAD_ZONE`, the half width of the new dead zone is 0. The other unknowns are not changed.
+    If no dead zone improves a fit without a dead zone by `IMPROVEMENT_BY_DEAD_ZONE`, the half
+    width of the new dead zone is 0. The other unknowns are not changed.
     """
     table = try_zones(fit)
     most = table.improvement.max()
-    if most - table.improvement[table.half_width == 0.0].max() < DEAD_ZONE:
+    most_without_zone = table.improvement[table.half_width == 0.0].max()
+    if most - most_without_zone < IMPROVEMENT_BY_DEAD_ZONE:
         return replace(fit, zone=DeadZone(table.centre.mean()))
     likeliest = table[table.improvement > most - 2.0]
     return replace(fit, zone=DeadZone(likeliest.centre.mean(), likeliest.half_width.mean()))
@@ -425,20 +429,20 @@ def with_zone(fit: Fit) -> Fit:
 def with_lags(fit: Fit) -> Fit:
     """Return `fit`, refined with two lags, or with one lag if two lags are hardly better.
 
-    Two lags are hardly better if they improve the fit by at most the constant `SECOND_LAG`.
+    Two lags are hardly better if the improvement is at most `IMPROVEMENT_BY_SECOND_LAG`.
     """
     single = replace(fit, unknowns=fit.unknowns._replace(ratio=0.0)).refined()
     # In a model with two lags, the second lag replaces a part of the delay of one lag.
     start = single.unknowns._replace(delay=0.7 * single.unknowns.delay, ratio=0.4)
     double = replace(single, unknowns=start).refined()
-    return double if single.improvement(double.squares) > SECOND_LAG else single
+    return double if single.improvement(double.squares) > IMPROVEMENT_BY_SECOND_LAG else single
 
 
 def with_load_steps(fit: Fit) -> Fit:
     """Return `fit` with new steps of unmeasured loads, which replace the load steps of `fit`.
 
-    Steps are added one by one, always the step that improves the fit most, while a step
-    improves the fit by at least the constant `LOAD_STEP`, and up to `MOST_LOAD_STEPS`.
+    Up to `MOST_LOAD_STEPS` steps are added one by one. Each added step is the step that
+    improves the fit most, and its improvement is at least `IMPROVEMENT_BY_LOAD_STEP`.
     """
     fit = replace(fit, load_steps=())
     slow = fit.unknowns.slow
@@ -451,7 +455,7 @@ def with_load_steps(fit: Fit) -> Fit:
     while len(fit.load_steps) < MOST_LOAD_STEPS:
         squares, _ = fit.try_candidates(without_flow, responses)
         best = int(np.argmin(squares))
-        if fit.improvement(squares[best]) < LOAD_STEP:
+        if fit.improvement(squares[best]) < IMPROVEMENT_BY_LOAD_STEP:
             break
         fit = replace(fit, load_steps=(*fit.load_steps, int(step_rows[best])))
     return fit
@@ -483,11 +487,12 @@ def estimates(fit: Fit) -> pd.DataFrame:
     `low` and `high`. `fit` must be a result of `Fit.refined` or `identify`.
     """
     values = fit.unknowns
-    margins = Unknowns(*(2.0 * SPREAD * np.array(fit.standard_errors)))
+    margins = Unknowns(*(INTERVAL * np.array(fit.standard_errors)))
     delay_margin = margins.delay + 0.5  # A log may be half a sample early or late.
+    # An improvement that is smaller by z^2 corresponds to a distance of z standard errors.
     table = try_zones(fit)
-    likely = table[table.improvement > table.improvement.max() - 4.0 * SPREAD**2]
-    step = table.half_width.max() / GRID
+    likely = table[table.improvement > table.improvement.max() - INTERVAL**2]
+    step = table.half_width.max() / GRID_POINTS
     narrowest = min(fit.zone.half_width, likely.half_width.min() - step)
     widest = max(fit.zone.half_width, likely.half_width.max() + step)
     # The dead zones that are nearly as likely as the likeliest one widen the interval of the
