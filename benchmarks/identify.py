@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.lib.command import Finite, Folder, command, options
+from benchmarks.lib.command import Finite, Folder, blame, command, options
 from benchmarks.lib.errors import UsageError
 from benchmarks.lib.provenance import origin
 from benchmarks.lib.results import results_folder
@@ -27,9 +27,11 @@ FEWEST_ROWS = 100  # of a log; a shorter log hardly shows a delay and a lag
 MOST_ROWS = 10_000  # that are used: the last rows of a longer log, to limit time and memory
 LONGEST_GAP = 20  # sampling intervals between two rows; longer gaps are not interpolated
 MOST_MISSING = 0.2  # largest share of the values of a column that may be missing
-# Matches texts of one to three digits and then groups of three digits: in the text 1,480, the
-# comma may be a decimal mark or may separate thousands.
+# Matches one to three digits and then groups of three digits, each behind a point or a comma.
+# The comma in 1,480 may be a decimal mark, or may separate thousands.
 THOUSANDS = r"[+-]?[1-9]\d{0,2}([.,]\d{3})+"
+# Finds the second number of a date such as 31.12.2025, 31/12/2025 or 12/31/2025.
+SECOND_OF_DATE = r"^\d{1,2}[./-](\d{1,2})[./-]"
 CAPTION = "The log as it was recorded, and as the model simulates it from the flow"
 
 
@@ -64,7 +66,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Identify the plant of a log, write the plant and a report, and return a closing line."""
+    """Identify the plant of a log, write all files, and return the closing message."""
     # SciPy reads this variable when SciPy is imported. With small matrices, several threads are
     # slower than one thread, as the threads wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -85,10 +87,8 @@ def work(options: Options) -> str:
     explained = explained_share(fit)
     arguments = plant_arguments(fit, options)
     ranges = arguments | argument_ranges(intervals, arguments)
-    try:
+    with blame("the environment cannot be such a plant"):
         Parameters(**ranges)
-    except ValueError as error:
-        raise UsageError(f"the environment cannot be such a plant: {error}") from error
     title = (
         f"A flow that is larger by 1 changes the temperature of {options.log.name} by "
         f"{fit.unknowns.gain:+.3g} after a delay of "
@@ -112,9 +112,11 @@ def read_log(options: Options) -> Log:
     gets the value of the row before. A `UsageError` is raised if the log cannot be used; the
     message says why.
     """
+    import pandas as pd  # here: slow to import, as below
+
     from benchmarks.loop.identification import Log
 
-    table = read_table(options.log)
+    table, separator = read_table(options.log)
     names = [options.flow, options.temperature, *options.disturbance]
     for name in [options.time, *names]:
         if name not in table:
@@ -125,38 +127,39 @@ def read_log(options: Options) -> Log:
             )
     if len({options.time, *names}) < len(names) + 1:
         raise UsageError(f"a column is used twice: {', '.join([options.time, *names])}")
-    rows, interval = row_numbers(read_times(table[options.time]))
-    numbers = table[names].apply(read_numbers).set_index(rows)
-    numbers = numbers.reindex(range(rows[-1] + 1))[-MOST_ROWS:]
+    samples, interval = sample_numbers(read_times(table[options.time], separator))
+    numbers = pd.DataFrame({name: read_numbers(table[name], separator) for name in names})
+    # Samples that are missing in the log become rows without values.
+    numbers = numbers.set_axis(samples).reindex(range(samples[-1] + 1))[-MOST_ROWS:]
     for name in names:
         share = numbers[name].isna().mean()
         if share > MOST_MISSING:
             raise UsageError(f"{100 * share:.0f} % of the values of {name!r} are missing")
-    temperature = numbers[options.temperature].interpolate(limit_direction="both").to_numpy()
-    held = numbers.ffill().bfill()
-    flow = held[options.flow].to_numpy()
-    for name, values in ((options.flow, flow), (options.temperature, temperature)):
-        if np.ptp(values) <= 1e-9 * np.abs(values).max():
+    filled = numbers.ffill().bfill()
+    temperature = numbers[options.temperature].interpolate(limit_direction="both")
+    filled[options.temperature] = temperature
+    for name in (options.flow, options.temperature):
+        if np.ptp(filled[name]) <= 1e-9 * filled[name].abs().max():
             raise UsageError(f"{name!r} is constant: the log does not show a response")
-    operating_flow = options.operating_flow
-    lowest, highest = flow.min() - np.ptp(flow), flow.max() + np.ptp(flow)
-    if operating_flow is not None and not lowest <= operating_flow <= highest:
+    flow = filled[options.flow].to_numpy()
+    centre = options.operating_flow
+    if centre is not None and np.abs(flow - centre).min() > np.ptp(flow):
         raise UsageError(
             f"operating_flow must be near the flows of the log, {flow.min():g} to "
-            f"{flow.max():g}, got {operating_flow:g}"
+            f"{flow.max():g}, got {centre:g}"
         )
-    return Log(flow, temperature, held[[*options.disturbance]].to_numpy(), interval)
+    disturbances = filled[[*options.disturbance]].to_numpy()
+    return Log(flow, temperature.to_numpy(), disturbances, interval)
 
 
-def read_table(path: Path) -> pd.DataFrame:
-    """Return the table in a CSV file as texts, with NaN in empty cells.
+def read_table(path: Path) -> tuple[pd.DataFrame, str]:
+    """Return the table in a CSV file, and the separator of its columns.
 
-    Columns are separated by semicolons or tabs if the first line of the file has one, and
-    otherwise by commas. A `UsageError` is raised if the file is not such a table or has fewer
-    than `FEWEST_ROWS` rows. The entry "marks" of the table's `attrs` has the possible decimal
-    marks.
+    The cells of the table are texts, or NaN where a cell is empty. The separator is a semicolon
+    or a tab if the first line of the file has one, and otherwise a comma. A `UsageError` is
+    raised if the file is not a table or has fewer than `FEWEST_ROWS` rows.
     """
-    import pandas as pd  # here: slow to import
+    import pandas as pd
 
     try:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
@@ -170,8 +173,7 @@ def read_table(path: Path) -> pd.DataFrame:
         raise UsageError(f"{path} cannot be read: {error.strerror}") from error
     except (pd.errors.EmptyDataError, pd.errors.ParserError) as error:
         raise UsageError(f"{path} is not a table: {str(error).strip()}") from error
-    for name in table:
-        table[name] = table[name].str.strip()
+    # If rows are longer than the heading, pandas takes the first column as the index.
     if not isinstance(table.index, pd.RangeIndex):
         raise UsageError(
             f"{path} has rows with more cells than the heading has names. Numbers with decimal "
@@ -179,114 +181,116 @@ def read_table(path: Path) -> pd.DataFrame:
         )
     if len(table) < FEWEST_ROWS:
         raise UsageError(f"the log has {len(table)} rows; it must have at least {FEWEST_ROWS}")
-    # Where commas separate the columns, a point is a decimal point.
-    table.attrs["marks"] = "," if separator == "," else ".,"
-    return table
+    return table.apply(lambda column: column.str.strip()), separator
 
 
-def read_numbers(column: pd.Series[str]) -> pd.Series[float]:
+def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
     """Return the numbers of a column of texts, with NaN for empty cells.
 
-    `column` is a column of `read_table`. A `UsageError` names the line of the first text that
-    is not a number. A `UsageError` is also raised if all texts with a decimal mark have three
-    digits behind the mark, as in "1,480", because the mark may separate thousands.
+    A `UsageError` names the line of the first text that is not a number, or that looks like
+    thousands. `separator` is the mark between the columns of the file.
     """
     import pandas as pd
 
-    marked = column[column.str.contains(f"[{column.attrs['marks']}]", na=False)]
-    if len(marked) and marked.str.fullmatch(THOUSANDS).all():
+    numbers = pd.to_numeric(column.str.replace(",", "."), errors="coerce").astype(np.float64)
+    # Where commas separate the columns, a point is a decimal point.
+    marks = "," if separator == "," else ".,"
+    has_mark = column.str.contains(f"[{marks}]", na=False)
+    marked = column[has_mark]
+    looks_like_thousands = bool(has_mark.any() and marked.str.fullmatch(THOUSANDS).all())
+    if separator != ",":
+        # The mark may well be a decimal mark. But if it separates thousands, and is read as a
+        # decimal mark, then the largest numbers of the column become the smallest.
+        sizes = numbers.abs()
+        looks_like_thousands &= bool(sizes[has_mark].max() < sizes[~has_mark].min())
+    if looks_like_thousands:
         raise UsageError(
             f"line {marked.index[0] + 2}: {column.name} looks like thousands: "
             f"{marked.iloc[0]!r}. Write the numbers without separators of thousands. If these "
             "are decimals, write another number of digits behind the decimal mark"
         )
-    numbers = pd.to_numeric(column.str.replace(",", "."), errors="coerce").astype(np.float64)
     # The square of a larger number might not be finite.
-    refuse(column, ~(numbers.abs() < 1e30) & column.notna(), "a number")
+    is_bad = ~(numbers.abs() < 1e30) & column.notna()
+    refuse(column, is_bad, "a number, or empty if the value is missing")
     return numbers
 
 
-def read_times(column: pd.Series[str]) -> NDArray[np.float64]:
+def read_times(column: pd.Series[str], separator: str) -> NDArray[np.float64]:
     """Return the times of a column of numbers (s) or dates, in seconds, shape (rows,).
 
-    `column` is a column of `read_table`. Dates become seconds since the first row. A
-    `UsageError` names the line of the first text that is neither a number nor a date.
+    Dates become seconds since the first row. A `UsageError` names the line of the first text
+    that is neither a number nor a date. `separator` is the mark between the columns of the
+    file.
     """
     import pandas as pd
 
     numbers = pd.to_numeric(column.str.replace(",", "."), errors="coerce")
     if numbers.count() > len(column) / 2:
-        refuse(column, numbers.isna(), "a number or a date")
-        return np.asarray(read_numbers(column), np.float64)
-    # Dates of ISO 8601 begin with the year, all others with the day.
-    is_iso = str(column.iloc[0])[:4].isdigit()
-    form: Any = "ISO8601" if is_iso else "mixed"
-    dates = pd.to_datetime(column, errors="coerce", utc=True, format=form, dayfirst=not is_iso)
-    refuse(column, dates.isna(), "a date")
-    return np.asarray((dates - dates.iloc[0]).dt.total_seconds())
+        times = read_numbers(column, separator)
+    else:
+        is_iso = str(column.iloc[0])[:4].isdigit()  # ISO 8601 begins with the year
+        form: Any = "ISO8601" if is_iso else "mixed"
+        # Other dates begin with the day, unless a second number is too large for a month.
+        second_numbers = column.str.extract(SECOND_OF_DATE, expand=False).astype(np.float64)
+        day_first = not is_iso and not (second_numbers > 12.0).any()
+        dates = pd.to_datetime(
+            column, errors="coerce", utc=True, format=form, dayfirst=day_first
+        )
+        times = (dates - dates.iloc[0]).dt.total_seconds()
+    refuse(column, times.isna(), "a number or a date, such as 2025-12-31 12:00")
+    return np.asarray(times, np.float64)
 
 
 def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> None:
     """Raise a `UsageError` if a column of the log has texts that cannot be read.
 
-    Parameters
-    ----------
-    column
-        The column of texts.
-    is_bad
-        Whether each text cannot be read. The message names the first line where this is true.
-    allowed
-        What a text must be, such as "a number", for the message.
+    The message names the line of the first text for which `is_bad` is true. `allowed` says what
+    a text must be, such as "a number".
     """
     if is_bad.any():
         line = int(np.argmax(is_bad)) + 2
-        raise UsageError(
-            f"line {line}: {column.name} must be {allowed}, got {column[is_bad].iloc[0]!r}. "
-            "Leave the cells of missing values empty"
-        )
+        text = column[is_bad].iloc[0]
+        raise UsageError(f"line {line}: {column.name} must be {allowed}, got {text!r}")
 
 
-def row_numbers(seconds: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
-    """Return the sample of each row, counted from the first row, and the sampling interval.
+def sample_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
+    """Return the sample number of each row, counted from 0, and the sampling interval, s.
 
-    The samples are integers, shape (rows,), and the sampling interval is in s. `seconds` has
-    the times of the rows, s, shape (rows,). A `UsageError` is raised if times do not increase,
-    if a row comes more than 0.4 sampling intervals early or late, or if 20 or more rows in
-    succession are missing.
+    Where rows are missing, sample numbers are left out. `times` has the times of the rows, s,
+    and has the shape of the sample numbers, (rows,). A `UsageError` is raised if times do not
+    increase, if a row comes more than 0.4 sampling intervals early or late, or if 20 or more
+    rows in succession are missing.
     """
-    steps = np.diff(seconds)
+    steps = np.diff(times)
     is_usual = np.abs(steps / np.median(steps) - 1.0) < 0.5
     interval = float(f"{np.mean(steps[is_usual]):.6g}")
-    samples = (seconds - seconds[0]) / interval
-    lateness = np.abs(samples - np.round(samples))
-    regular = f"most time steps are {interval:g} s. Resample the log"
+    exact_samples = (times - times[0]) / interval
+    samples = np.round(exact_samples)
+    is_irregular = np.abs(exact_samples - samples)[1:] > 0.4
+    is_irregular |= np.diff(samples) < 1.0  # two rows in one sample
+    gap = (
+        "rows are missing before it. Divide the log there. If the dates begin with the month, "
+        "write dates such as 2025-12-31"
+    )
     for is_bad, advice in (
         (steps <= 0.0, "times must increase. Sort the rows, and remove repeated ones"),
-        (steps > LONGEST_GAP * interval, "rows are missing before it. Divide the log there"),
-        (np.diff(np.round(samples)) < 1.0, regular),
-        (lateness[1:] > 0.4, regular),
+        (steps > LONGEST_GAP * interval, gap),
+        (is_irregular, f"most time steps are {interval:g} s. Resample the log"),
     ):
         if is_bad.any():
             row = int(np.argmax(is_bad))
             raise UsageError(f"line {row + 3}: a time step of {steps[row]:g} s: {advice}")
-    return np.round(samples).astype(np.int64), interval
+    return samples.astype(np.int64), interval
 
 
 def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
     """Return the warnings of the report: a sentence for each reason why a fit may be wrong.
 
-    Parameters
-    ----------
-    fit
-        The fit of the log.
-    intervals
-        The table of `benchmarks.loop.identification.estimates`.
-    explained
-        The result of `benchmarks.loop.identification.explained_share`.
+    `intervals` is the table of `benchmarks.loop.identification.estimates`, and `explained` is
+    the result of `explained_share` in the same module.
     """
-    log, errors = fit.log, fit.errors
     sentences = []
-    last_third = log.flow[-(len(log.flow) // 3) :]
+    last_third = fit.log.flow[-(len(fit.log.flow) // 3) :]
     if np.ptp(last_third) == 0.0:
         sentences.append(
             "The flow does not move in the last third of the log, so the model could not be "
@@ -298,28 +302,44 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
             "of the temperature in the last third of the log: the plant has changed, or "
             "something other than the flow has moved the temperature."
         )
-    correlations = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
-    is_large = np.abs(correlations) > max(0.1, 2.5 / np.sqrt(len(errors)))
-    if np.mean(is_large) > 0.25:
+    if not is_white(fit.errors):
         sentences.append(
             "The prediction errors are not white noise: the plant or its disturbances are not "
             "of the model's form, and the intervals are too narrow."
         )
-    if len(fit.zones) == 2:
+    if len(fit.zones) == 2:  # as `possible_zones` returns them for such a flow
         sentences.append("The flow had fewer than three values: no dead zone can be found.")
     if intervals.low["gain"] <= 0.0 <= intervals.high["gain"]:
         sentences.append("The interval of the gain holds 0: the sign of the gain is unknown.")
-    moves = np.diff(log.temperature)
-    span = np.ptp(log.temperature)
+    return sentences + doubts_about_sensor(fit.log.temperature)
+
+
+def is_white(errors: NDArray[np.float64]) -> bool:
+    """Return whether prediction errors, shape (blocks,), look like white noise.
+
+    Errors look like white noise if at most a quarter of their autocorrelations, at lags from 1
+    to 30 blocks, are larger than chance explains.
+    """
+    correlations = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
+    is_large = np.abs(correlations) > max(0.1, 2.5 / np.sqrt(len(errors)))
+    return bool(np.mean(is_large) <= 0.25)
+
+
+def doubts_about_sensor(temperature: NDArray[np.float64]) -> list[str]:
+    """Return warnings if a recorded temperature, shape (rows,), was compressed or frozen."""
+    sentences = []
+    moves = np.diff(temperature)
+    span = np.ptp(temperature)
     is_straight = np.abs(np.diff(moves)) < 1e-6 * span
-    if np.mean(is_straight & (np.abs(moves[1:]) > 1e-4 * span)) > 1.0 / 3.0:
+    is_moving = np.abs(moves[1:]) > 1e-4 * span
+    if np.mean(is_straight & is_moving) > 1.0 / 3.0:
         sentences.append(
             "The temperature lies on straight lines between few values, as a historian that "
             "compresses data keeps it: the delay and the intervals are not reliable."
         )
     changes = np.flatnonzero(np.r_[True, moves != 0.0, True])
-    longest = int(np.diff(changes).max())
-    if longest > max(20, len(log.flow) / 20):
+    longest = int(np.diff(changes).max())  # number of rows in succession with one value
+    if longest > max(20, len(temperature) / 20):
         sentences.append(
             f"The temperature is frozen: {longest} rows in succession have the same value."
         )
@@ -341,11 +361,10 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
     flow = fit.log.flow - fit.zone.centre
     u_min = float(flow.min()) if options.u_min is None else options.u_min
     u_max = float(flow.max()) if options.u_max is None else options.u_max
-    # How far the flow can move the temperature to both sides, as the set point has both signs.
-    reach = abs(fit.unknowns.gain) * max(-u_min, u_max)
-    if not is_one_sided(u_min, u_max):
-        reach = abs(fit.unknowns.gain) * min(-u_min, u_max)
-    widest_reach = abs(fit.unknowns.gain) * max(-u_min, u_max)
+    smaller_limit, larger_limit = sorted([-u_min, u_max])
+    # The set point has both signs, so that the flow must move to both sides.
+    usable_limit = larger_limit if is_one_sided(u_min, u_max) else smaller_limit
+    gain = abs(fit.unknowns.gain)
     settling = delay + round(4.0 * (fit.unknowns.slow + fit.unknowns.fast))  # samples
     return {
         "a": a.tolist(),
@@ -357,14 +376,17 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
         "u_max": u_max,
         "noise_variance": noise_variance,
         "sampling_interval": fit.log.sampling_interval,
-        "setpoint_amplitude": min(0.6 * reach, defaults.setpoint_amplitude),
+        "setpoint_amplitude": min(0.6 * (gain * usable_limit), defaults.setpoint_amplitude),
         "setpoint_period": max(2 * settling, defaults.setpoint_period),
-        "temperature_span": max(1.5 * widest_reach, defaults.temperature_span),
+        "temperature_span": max(1.5 * (gain * larger_limit), defaults.temperature_span),
     }
 
 
 def is_one_sided(u_min: float, u_max: float) -> bool:
-    """Return whether the flow can hardly move to one side of the operating flow."""
+    """Return whether the flow can hardly move to one side of the operating flow.
+
+    `u_min` and `u_max` are the limits of the flow, as deviations from the operating flow.
+    """
     return min(-u_min, u_max) < 0.2 * max(-u_min, u_max)
 
 
@@ -374,28 +396,23 @@ def argument_ranges(
     """Return the 95 % intervals of a plant as ranges of the environment's arguments.
 
     A range is a list [low, high]. An argument whose interval has a length of 0 is left out.
-
-    Parameters
-    ----------
-    intervals
-        The table of `benchmarks.loop.identification.estimates`.
-    arguments
-        The arguments of the environment for the plant, as `plant_arguments` returns them.
+    `intervals` is the table of `benchmarks.loop.identification.estimates`, and `arguments` is
+    the result of `plant_arguments`.
     """
     limits = intervals[["low", "high"]].T
     largest_flow = max(-arguments["u_min"], arguments["u_max"])
     gain_factors = limits.gain / intervals.value["gain"]
-    # `time_constant_factor` multiplies the environment's time constant, 1 / rate samples with
-    # the rate 1 - pole. The environment accepts factors above the rate.
+    # A time constant factor f divides the rate of the plant's pole, which is 1 - pole, and the
+    # environment accepts factors above the rate.
     rates = 1.0 - np.exp(-arguments["sampling_interval"] / intervals.loc["time_constant"])
-    slow_factors = np.clip(
+    lag_factors = np.clip(
         rates["value"] / rates[["low", "high"]], 1.000001 * rates["value"], 10.0
     )
     ranges = {
         "delay": [round(delay) for delay in limits.delay],
         "dead_zone": limits.dead_zone.clip(upper=0.99 * largest_flow).tolist(),
         "gain_factor": sorted(gain_factors.clip(0.1, 10.0)),
-        "time_constant_factor": slow_factors.tolist(),
+        "time_constant_factor": lag_factors.tolist(),
     }
     return {name: pair for name, pair in ranges.items() if pair[0] < pair[1]}
 
@@ -405,16 +422,8 @@ def findings(
 ) -> list[str]:
     """Return the paragraphs of the report that follow the warnings.
 
-    Parameters
-    ----------
-    fit
-        The fit of the log.
-    explained
-        The result of `benchmarks.loop.identification.explained_share`.
-    arguments
-        The arguments of the environment for the plant, as `plant_arguments` returns them.
-    options
-        The options of the command.
+    `explained` is the result of `benchmarks.loop.identification.explained_share`, and
+    `arguments` is the result of `plant_arguments`.
     """
     log, centre = fit.log, fit.zone.centre
     text = [
@@ -433,12 +442,15 @@ def findings(
     if fit.load_steps:
         minutes = [log.sampling_interval * row / 60.0 for row in sorted(fit.load_steps)]
         times = ", ".join(f"{minute:.0f}" for minute in minutes)
-        text.append(f"By the fit, an unmeasured load stepped {times} min after the first row.")
+        text.append(
+            "The model has steps of an unmeasured load at these times after the first row: "
+            f"{times} min."
+        )
     if is_one_sided(arguments["u_min"], arguments["u_max"]):
         text.append(
-            "Warning: the flow in the log moves hardly to one side of the operating point. Set "
-            "the limits of the valve with --u-min and --u-max before you compare controllers; "
-            "otherwise, they cannot follow half of the set points."
+            "Warning: the flow hardly moves to one side of the operating point. Set the limits "
+            "of the valve with --u-min and --u-max before you compare controllers; otherwise, "
+            "no controller can follow half of the set points."
         )
     if options.disturbance:
         names = ", ".join(options.disturbance)
@@ -455,20 +467,17 @@ def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
 
     `intervals` is the table of `benchmarks.loop.identification.estimates`.
     """
-    import pandas as pd
-
-    rows = []
-    for name, (value, low, high) in intervals.iterrows():
-        label = str(name).replace("_", " ")
-        rows.append((label, f"{value:.4g}", f"[{low:.4g}, {high:.4g}]"))
-    return pd.DataFrame(rows, columns=["", "value", "95 % interval"])
+    texts = intervals.map("{:.4g}".format)
+    texts["95 % interval"] = "[" + texts.low + ", " + texts.high + "]"
+    texts.insert(0, "", texts.index.str.replace("_", " "))
+    return texts.drop(columns=["low", "high"])
 
 
 def draw(fit: Fit, title: str, path: Path) -> None:
-    """Draw the temperature of a log, the simulated temperature, and the flow over time.
+    """Draw the recorded and the simulated temperature of a log, and the flow, over time.
 
-    The simulated temperature is that of the model in `fit`, without noise. `title` is the title
-    of the picture, and `path` is the PNG file.
+    The simulation of the model in `fit` has no noise. `title` is the title of the picture, and
+    `path` is the PNG file.
     """
     from benchmarks.lib.pictures import COLOURS, DEAD_ZONE, open_picture
 
@@ -477,8 +486,8 @@ def draw(fit: Fit, title: str, path: Path) -> None:
     with open_picture(path, 4.6, title) as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
         above.plot(minutes, log.temperature, color="0.5", lw=1, label="recorded")
-        after = slice(fit.first_row, None)
-        above.plot(minutes[after], fit.simulated[after], color=COLOURS[1], label="model")
+        fitted = slice(fit.first_row, None)
+        above.plot(minutes[fitted], fit.simulated[fitted], color=COLOURS[1], label="model")
         for number, row in enumerate(fit.load_steps):
             label = "step of a load" if number == 0 else None
             above.axvline(minutes[row], color="0.5", ls=":", label=label)

@@ -38,33 +38,36 @@ PLANTS = 200  # default number of plants in a random design
 OSCILLATES = 1.0
 # Headings and number formats of the report's table, by the names of columns of `summarise`.
 COLUMNS = {
-    "multiple": ("error ratio, median", "{:.3f}"),
-    "multiple_p90": ("error ratio, 90 %", "{:.3f}"),
-    "travel": ("travel (t/h)", "{:,.0f}"),
-    "oscillates": ("oscillates (%)", "{:.1f}"),
-    "useless": ("no better than an idle valve (%)", "{:.1f}"),
+    "multiple": ("error ratio (median)", "{:.3f}"),
+    "multiple_p90": ("error ratio (90th percentile)", "{:.3f}"),
+    "travel": ("valve travel (t/h)", "{:,.0f}"),
+    "oscillates": ("runs that oscillate (%)", "{:.1f}"),
+    "useless": ("runs no better than an idle valve (%)", "{:.1f}"),
 }
-TEXT = (
-    "The error ratio is the mean error divided by the least possible error. The table gives "
-    "the median and the 90th percentile of the error ratio over the plants, where a plant has "
-    "the ratio of its median run. Travel is the valve travel of the median run. A run "
-    "oscillates if the standard deviation of the error on steady stretches is "
-    f"{OSCILLATES:g} °C larger than with an idle valve. The last two columns are shares of the "
-    "runs."
+RATIOS = (
+    "The error ratio of a run is its mean error divided by the least possible error. The error "
+    "ratio of a plant is the median over the runs on the plant, and the table gives the median "
+    "and the 90th percentile over the plants."
+)
+FAILURES = (
+    "The valve travel is the sum of all changes of the flow in a run, and the table gives the "
+    "median over all runs. A steady stretch is the second half of the time between two changes "
+    "of the set point. A run oscillates if the standard deviation of its error on steady "
+    f"stretches is more than {OSCILLATES:g} °C larger than with an idle valve. A run is no "
+    "better than an idle valve if its mean error is at least as large as with an idle valve."
 )
 PICTURE = "The error of each controller on each plant, relative to the least possible error"
 # Groups of plants in a random design: a name, and a condition on the plants' arguments for
-# `DataFrame.query`. The ends of the delays divide the drifting plants into three groups of
+# `DataFrame.query`. The limits of the delay divide the plants that drift into three groups of
 # about equal size.
 GROUPS = {
     "no drift": "gain_drift.isna()",
     "all that drift": "gain_drift > 0",
-    "delay below 14 samples": "gain_drift > 0 and delay < 14",
-    "delay from 14 to 22 samples": "gain_drift > 0 and 14 <= delay <= 22",
-    "delay above 22 samples": "gain_drift > 0 and delay > 22",
+    "drift, delay below 14 samples": "gain_drift > 0 and delay < 14",
+    "drift, delay from 14 to 22 samples": "gain_drift > 0 and 14 <= delay <= 22",
+    "drift, delay above 22 samples": "gain_drift > 0 and delay > 22",
 }
-# Questions of the report, with pairs of controllers: is the error of the first controller in a
-# pair smaller than that of the second?
+# Questions of the report. For each question, the report compares pairs of controllers.
 QUESTIONS = {
     "Does online learning help when the plant drifts?": (
         ("nn", "pi-simc"),
@@ -78,7 +81,11 @@ QUESTIONS = {
         ("self-tuning", "smith"),
     ),
 }
-DIFFERENCES = "Differences of the mean error (°C), 95 % interval; below 0 the first is better."
+DIFFERENCES = (
+    "The table gives differences between the mean errors of two controllers, in °C, with 95 % "
+    "intervals. A difference below 0 °C means that the controller named first has the smaller "
+    "error."
+)
 
 
 @options
@@ -86,19 +93,20 @@ DIFFERENCES = "Differences of the mean error (°C), 95 % interval; below 0 the f
 class Options:
     """Run controllers on plants that they were not made for.
 
-    They were made for the paper's plant, or for the plant of --plant, --preset or --set. The
-    design says how the other plants differ from this plant.
+    The nominal plant is the paper's plant, or the plant of --plant, --preset or --set. The
+    controllers are made for the nominal plant, and run on variations of the nominal plant.
     """
 
     design: Literal["grid", "random"] = "grid"
-    """20 delays by 10 gains, or plants that differ in everything, half of which drift."""
+    """grid: plants with 20 delays and 10 gains; random: plants that differ in delay, dead zone,
+    noise, gain and time constant, half of which drift."""
     plants: Runs | None = None
     """Plants of a random design (default: 200)."""
     design_seed: Seed | None = None
     """Seed for the plants of a random design (default: 0)."""
     told: Literal["nominal", "each"] = "nominal"
-    """nominal: every controller is made for the one plant above; each: for the plant that it
-    controls, as this plant is before any drift."""
+    """nominal: every controller is made for the nominal plant; each: every controller is made
+    for the plant that it controls, as the plant is before it drifts."""
     runs: Runs = 20
     """Runs of a controller on a plant."""
     agents: AgentNames = tuple(name for name, spec in ROSTER.items() if spec.swept)
@@ -118,15 +126,17 @@ def work(options: Options) -> str:
     tasks = tasks_of(options, controllers, nominal, plants)
     provenance = origin()
     target = options.out or Path(f"results/sweep-{options.design}")
-    # The conditions do not cover the code of a user's own controller.
+    # A user's own code may change between two runs, so its results are not kept for the next.
     conditions = None if options.controllers.agent else conditions_of("sweep", options)
     results: dict[str, Any] = {}
     with results_folder(target, conditions) as folder:
-        finished = KeptResults(folder) if conditions else None
+        kept = KeptResults(folder) if conditions else None
         try:
-            results.update(options.controllers.fan_out.stream(tasks, "sweep", finished))
+            # After an error, `results` has what was streamed before the error.
+            results.update(options.controllers.fan_out.stream(tasks, "sweep", kept))
         finally:
-            if missing := len(tasks) - len(results):
+            missing = len(tasks) - len(results)
+            if missing:
                 provenance["missing"] = f"{missing} of {len(tasks)} tasks are missing"
             runs = table(plants, list(controllers), results)
             if not runs.empty:
@@ -141,17 +151,18 @@ def work(options: Options) -> str:
 def design(options: Options, nominal: Arguments) -> list[Arguments]:
     """Return, for each plant of the design, the arguments that differ from the nominal plant.
 
-    `nominal` holds the arguments of the environment for the plant that the controllers are made
-    for. A `UsageError` is raised if options contradict each other, or if a plant is invalid.
+    `nominal` holds the environment's arguments for the nominal plant. A `UsageError` is raised
+    if options contradict each other, or if a plant is invalid.
     """
-    gains = np.linspace(0.75, 1.65, 10).round(6).tolist()
-    plants: list[Arguments] = [
-        {"delay": delay, "gain_factor": gain} for gain in gains for delay in range(2, 42, 2)
-    ]
+    plants: list[Arguments] = []
     if options.design == "random":
         plants = random_design(options.plants or PLANTS, options.design_seed or 0, SAMPLES)
     elif options.plants or options.design_seed is not None:
         raise UsageError("--plants and --design-seed are for --design random")
+    else:
+        for gain_factor in np.linspace(0.75, 1.65, 10).round(6).tolist():
+            for delay in range(2, 42, 2):
+                plants.append({"delay": delay, "gain_factor": gain_factor})
     with blame(f"--design {options.design}"):
         plants = around(nominal, plants)
         for plant in plants:
@@ -168,7 +179,7 @@ def tasks_of(
     """Return the runs of the sweep as functions without arguments, by name.
 
     The name is "plant 0" for the idle valve on the first plant, and "plant 0, nn" for the
-    controller `nn` on the same plant.
+    controller `nn` on the first plant.
 
     Parameters
     ----------
@@ -178,25 +189,25 @@ def tasks_of(
         The controllers by name. A controller can have several members, such as networks that
         were trained from different seeds.
     nominal
-        Arguments of the environment for the plant that the controllers are made for.
+        The environment's arguments for the nominal plant.
     plants
         For each plant, the arguments that differ from the nominal plant.
     """
-    members = {name: controller.members() for name, controller in controllers.items()}
+    members_of = {name: controller.members() for name, controller in controllers.items()}
     ranges = ranges_of(plants)
     tasks: dict[str, Any] = {}
     for i, plant in enumerate(plants):
         case = {**nominal, **plant, **SETPOINT}
         tasks[f"plant {i}"] = partial(run_idle_valve, case, options.runs)
-        for name, members_of_controller in members.items():
+        for name, members in members_of.items():
             # Each plant gets the next member of a controller, so that a map over the plants
             # shows how much the members differ.
-            member = members_of_controller[i % len(members_of_controller)]
-            prior = {**nominal, **SETPOINT}
-            if "delay_range" in member.prior_knowledge:
-                prior |= ranges
-            if options.told == "each":
-                prior = case
+            member = members[i % len(members)]
+            prior = case
+            if options.told == "nominal":
+                prior = {**nominal, **SETPOINT}
+                if "delay_range" in member.prior_knowledge:
+                    prior |= ranges
             tasks[f"plant {i}, {name}"] = partial(run_agent, member, prior, case, options.runs)
     return tasks
 
@@ -224,9 +235,9 @@ def run_agent(
     controller
         The controller.
     prior
-        Arguments of the environment for the plant that the controller is made for.
+        The environment's arguments for the plant that the controller is made for.
     case
-        Arguments of the environment for the plant on which the controller runs.
+        The environment's arguments for the plant on which the controller runs.
     runs
         Number of runs.
 
@@ -245,17 +256,18 @@ def run_agent(
 def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
     """Run an idle valve on a plant, and return its measures and the least possible error.
 
-    `case` holds the plant's arguments of the environment. The measures are those of
-    `run_agent`. The least possible error, `limit`, degC, is of the kind "reference"; it is NaN
-    if the plant does not settle between changes of the set point.
+    `case` holds the environment's arguments for the plant, and `runs` is the number of runs.
+    The result has the measures of `run_agent`, and `least_possible`, the least possible mean
+    error of any controller, degC. `least_possible` is NaN if the plant does not settle between
+    changes of the set point.
     """
     from benchmarks.bounds.least import least_possible
 
-    measures = {**run_agent(ROSTER["idle"], case, case, runs), "limit": math.nan}
+    measures = run_agent(ROSTER["idle"], prior=case, case=case, runs=runs)
+    least = math.nan
     with suppress(NoBoundError):
-        least = least_possible(samples=SAMPLES, kind="reference", **case)
-        measures["limit"] = least.value
-    return measures
+        least = least_possible(samples=SAMPLES, kind="reference", **case).value
+    return {**measures, "least_possible": least}
 
 
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
@@ -277,10 +289,10 @@ def table(
 ) -> pd.DataFrame:
     """Return a table with a row for each run that has finished.
 
-    A row has the number and the arguments of the plant, the name of the controller, the
-    measures of `run_agent`, and comparisons with an idle valve in the same noise: `limit`, the
-    least possible error, degC; `ratio`, the mean error divided by `limit`; and whether the run
-    `oscillates` and is `useless`, no better than an idle valve.
+    The columns are `plant` (the number of the plant), `agent` (the name of the controller), the
+    measures of `run_agent`, `limit` (the least possible error, degC), `ratio` (the mean error
+    divided by `limit`), `oscillates` (whether the run oscillates), `useless` (whether the run
+    is no better than an idle valve in the same noise), and the arguments of the plant.
 
     Parameters
     ----------
@@ -300,8 +312,8 @@ def table(
             measures = results.get(f"plant {i}, {agent}")
             if idle and measures:
                 comparisons = {
-                    "limit": idle["limit"],
-                    "ratio": measures["mae"] / idle["limit"],
+                    "limit": idle["least_possible"],
+                    "ratio": measures["mae"] / idle["least_possible"],
                     "oscillates": measures["swing"] > idle["swing"] + OSCILLATES,
                     "useless": measures["mae"] >= idle["mae"],
                 }
@@ -311,17 +323,21 @@ def table(
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with a row for each controller: `agent`, and the columns of `COLUMNS`.
+    """Return a table with a row for each controller.
 
-    `runs` is what `table` returns. The constant `TEXT` defines the columns.
+    The columns are `agent` (the name of the controller), `multiple` and `multiple_p90` (the
+    median and the 90th percentile over the plants of the median error ratio on a plant),
+    `travel` (the median valve travel of the runs, t/h), and `oscillates` and `useless` (shares
+    of the runs, %). `runs` is the table that the function `table` returns.
     """
     by_agent = runs.groupby("agent", sort=False)
-    by_plant = runs.groupby(["agent", "plant"], sort=False)
-    ratios = by_plant["ratio"].median().groupby("agent", sort=False)
-    shares = 100.0 * by_agent[["oscillates", "useless"]].mean()
-    travel = by_agent["total_variation"].median()
-    columns = {"multiple": ratios.median(), "multiple_p90": ratios.quantile(0.9)}
-    return shares.assign(**columns, travel=travel)[[*COLUMNS]].reset_index()
+    ratios_of_plants = runs.groupby(["agent", "plant"], sort=False)["ratio"].median()
+    ratios = ratios_of_plants.groupby("agent", sort=False)
+    summary = 100.0 * by_agent[["oscillates", "useless"]].mean()
+    summary["multiple"] = ratios.median()
+    summary["multiple_p90"] = ratios.quantile(0.9)
+    summary["travel"] = by_agent["total_variation"].median()
+    return summary[[*COLUMNS]].reset_index()
 
 
 def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Arguments) -> None:
@@ -336,7 +352,7 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Argum
     out
         Folder of the report.
     nominal
-        The plant that the controllers are made for.
+        The nominal plant.
     provenance
         Command, commit and versions, for the report.
     """
@@ -348,41 +364,46 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Argum
     overview.insert(0, "controller", overview.pop("agent").map(label))
     for name, (heading, form) in COLUMNS.items():
         overview[heading] = overview.pop(name).map(form.format)
+    texts = [RATIOS, FAILURES]
     pictures = {"map.png": PICTURE}
-    sections = [Section("Errors on other plants", [TEXT], overview, pictures=pictures)]
+    sections = [Section("Errors on other plants", texts, overview, pictures=pictures)]
     if "gain_drift" in runs:
-        for title, pairs in QUESTIONS.items():
-            pairs_that_ran = [pair for pair in pairs if set(pair) <= set(runs["agent"])]
-            if pairs_that_ran and len(compared := differences(runs, pairs_that_ran)):
-                sections.append(Section(title, [DIFFERENCES], compared))
+        agents = set(runs["agent"])
+        for question, pairs in QUESTIONS.items():
+            pairs_that_ran = [pair for pair in pairs if agents.issuperset(pair)]
+            answers = differences(runs, pairs_that_ran)
+            if not answers.empty:
+                sections.append(Section(question, [DIFFERENCES], answers))
     write_report(out, "Controllers on other plants", sections, provenance)
 
 
 def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:
     """Return a table of the differences between the mean errors of two controllers, as text.
 
-    A difference is the mean error of the first controller in a pair minus that of the second,
-    degC, with a 95 % interval. The table has a column for each of `pairs`, and a row for each
-    of `GROUPS` with at least two plants on which all controllers of the pairs have finished.
-    `runs` is what the function `table` returns.
+    A difference is the mean error of the first controller in a pair minus the mean error of the
+    second controller, degC, with a 95 % interval. The table has a column for each of `pairs`,
+    and a row for each of `GROUPS` with at least two plants on which all controllers of the
+    pairs have finished. `runs` is the table that the function `table` returns.
     """
     import pandas as pd
 
     from benchmarks.lib.statistics import bootstrap
 
     agents = {agent for pair in pairs for agent in pair}
-    of_agents = runs[runs["agent"].isin(agents)]
-    errors = of_agents.pivot(index="plant", columns=["agent", "run"], values="mae").dropna()
+    runs_of_agents = runs[runs["agent"].isin(agents)]
+    errors = runs_of_agents.pivot(index="plant", columns=["agent", "run"], values="mae")
+    errors = errors.dropna()
     plants = runs.drop_duplicates("plant").set_index("plant").loc[errors.index]
     rows = []
-    for name, condition in GROUPS.items():
+    for group, condition in GROUPS.items():
         errors_of_group = errors.loc[plants.query(condition).index]
-        if len(errors_of_group) < 2:
+        count = len(errors_of_group)
+        if count < 2:
             continue
-        row = {"plants": name, "number": str(len(errors_of_group))}
+        row = {"plants": group, "number of plants": str(count)}
         for first, second in pairs:
-            differences_of_runs = errors_of_group[first] - errors_of_group[second]
-            estimate = bootstrap(differences_of_runs.to_numpy(), seed=SEED)
+            difference = errors_of_group[first] - errors_of_group[second]
+            estimate = bootstrap(difference.to_numpy(), seed=SEED)
             row[f"{label(first)} - {label(second)}"] = f"{estimate:+.3f}"
         rows.append(row)
     return pd.DataFrame(rows)

@@ -13,7 +13,6 @@ import numpy as np
 
 from benchmarks.controllers.plant_scale import scale_of
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.command import (
     Folder,
     Parameter,
@@ -39,17 +38,32 @@ STARTUP = 200  # number of trials with random gains, before the sampler learns f
 FIRST_RUN = SEEDS["preparation"].first  # seed of the first run of every trial
 SPACING = 100_000  # from the first seed of a case to the first seed of the next case
 FINALISTS = 10  # number of best trials that are judged again on new runs
-FINAL_RUNS = 1000  # runs of each case, to judge a finalist
-FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first run of a finalist
+FINAL_RUNS = 1000  # runs of each case, to judge gains on new runs
+FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first of these runs
 # Penalty for a run that does not settle, degC: the mean error of an idle valve if the set point
 # is 5 degC.
 PENALTY = 5.0
 LARGEST_ZONE = 0.95  # largest dead zone of a case, as a share of the larger limit of the flow
-TUNED = [name for name, spec in ROSTER.items() if spec.spans]
+# The functions that return the intervals of a search on a plant, by the name of the controller.
+SPANS = {name: spec.spans for name, spec in ROSTER.items() if spec.spans}
+# The controllers of other commands that differ from the controller of a search in their gains
+# only, and the origin of their gains: a text for the report.
+FIXED_GAINS = {
+    "nn": {"nn": "the search of version 0.1"},
+    "pi": {"pi": "the paper", "pi-searched": "the search of version 0.1"},
+    "dahlin": {"dahlin": "a tuning rule"},
+}
 NOTE = (
-    "For each case, the median over runs of the mean absolute error, °C. The objective is the "
-    f"mean of these medians, plus {PENALTY:g} °C times the share of runs that do not settle at "
-    "the constant set point; on another plant, that penalty is scaled with the set points."
+    "For each case, the table gives the median over the runs of the mean absolute error, in "
+    "°C. The column “not converged” gives the share of runs that do not settle at the constant "
+    f"set point. The objective is the mean of the medians, plus {PENALTY:g} °C times this "
+    "share; if a plant has set points other than those of the paper's plant, the penalty is "
+    "scaled with the set points."
+)
+FINALS_NOTE = "The column “in the search” gives the objective of the same gains in the search."
+FIXED_NOTE = (
+    "Other commands, such as benchmarks.compare, run controllers with the gains in the "
+    "following table. The table gives the objective of these gains on the new runs."
 )
 PAPER = Parameters()  # the paper's plant
 PAPER_NOISE = PRESETS["noisy"]["noise_variance"]  # noise variance R of the paper, degC^2
@@ -71,8 +85,8 @@ class TuningCase(NamedTuple):
 
 
 # Cases on the paper's plant that are similar to the paper's cases, but not equal, so that gains
-# are not tuned to a published result. In three cases, the mean error of an untrained controller
-# counts from the first sample on; in two cases, it counts only after the controller has learnt.
+# are not tuned to a published result. In the cases called "learnt", the errors count only after
+# a controller has had time to learn; in the other cases, the errors count from the start.
 CASES = {
     "constant": TuningCase(600, 0, {"setpoint": 4.8}),
     "dead zone": TuningCase(
@@ -91,13 +105,13 @@ CASES = {
 class Options:
     """Tune a controller's gains with Optuna, by default on the paper's plant.
 
-    All trials use the same set points and seeds, which no comparison uses. `gains.json` holds
-    the best gains: `benchmarks.compare --agent NAME=gains.json` runs the controller with them.
-    If a search was stopped, the same command with the same code continues it, to the same
-    result.
+    All trials use the same set points and seeds, which no comparison uses. The command
+    `benchmarks.compare --agent NAME=gains.json` runs the controller with the best gains, which
+    are in the file `gains.json`. If a search was stopped, the same command with the same code
+    continues the search, to the same result.
     """
 
-    controller: Annotated[str, Parameter(choices=TUNED)] = field(kw_only=False)
+    controller: Annotated[str, Parameter(choices=SPANS)] = field(kw_only=False)
     """The controller whose gains to search."""
     trials: Runs = 800
     """How many sets of gains to try."""
@@ -114,28 +128,30 @@ def work(options: Options) -> str:
     provenance = origin()
     name = options.controller
     plant = options.plant.arguments()
-    gains = [*spans_of(ROSTER[name], plant)]
+    gains = [*spans_of(name, plant)]
     target = options.out / name
     with results_folder(target, conditions_of("tune", options)) as folder:
         trials = search(name, plant, options.trials, options.runs, folder)
-        table = finals(name, plant, trials)
+        finalists = finals(name, plant, trials)
         samples = options.runs * sum(case.samples for case in cases(plant).values())
         budget = f"{len(trials)} trials: {len(trials) * samples / 1e6:.3g} M samples"
         content = {
             "controller": name,
-            "gains": table.loc[0, gains].to_dict(),
+            "gains": finalists.loc[0, gains].to_dict(),
             "plant": plant,
             "knows": "gains of a search on this plant",
             "searched": f"{len(gains)} gains by {budget}",
         }
         write_json(folder / "gains.json", content)
-        title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS} new runs"
-        sections = [Section(title, [NOTE], table.map("{:.4g}".format))]
-        write_report(folder, f"Gains: {ROSTER[name].label}", sections, provenance)
+        title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS:,} new runs"
+        best = Section(title, [NOTE, FINALS_NOTE], finalists.map("{:.4g}".format))
+        fixed = Section("Gains before this search", [FIXED_NOTE], fixed_gains(name, plant))
+        write_report(folder, f"Gains: {ROSTER[name].label}", [best, fixed], provenance)
     words = [*options.plant.words(), "--agent", f"my-{name}={target}/gains.json"]
     return (
-        f"All trials are in {target}/trials.csv, the best in {target}/report.md. To compare "
-        f"them: python -m benchmarks.compare {shlex.join(words)}"
+        f"All trials are in {target}/trials.csv, and the best gains are in {target}/report.md. "
+        "The following command compares the best gains with other controllers: python -m "
+        f"benchmarks.compare {shlex.join(words)}"
     )
 
 
@@ -162,7 +178,7 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     best = trials.nsmallest(FINALISTS, "objective")
-    gains = [*spans_of(ROSTER[name], plant)]
+    gains = [*spans_of(name, plant)]
     rounded: Any = best[gains].map(lambda gain: float(f"{gain:.3g}")).to_dict("records")
     rows = [score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, finalist) for finalist in rounded]
     table = pd.DataFrame(rows)
@@ -170,7 +186,27 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
     return table.sort_values("objective", ignore_index=True)
 
 
-def spans_of(spec: ControllerSpec, plant: Arguments) -> Mapping[str, tuple[float, float]]:
+def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
+    """Score the gains of `FIXED_GAINS` on new runs, and return a table of texts.
+
+    A row has the label of a controller, the origin of its gains, the gains, and the objective,
+    degC. `name` is the name of the controller whose gains were searched, and `plant` has the
+    arguments of the environment for the plant of the search.
+    """
+    import pandas as pd
+
+    rows = []
+    for other, origin_of_gains in FIXED_GAINS[name].items():
+        controller = ROSTER[other].make(plant, 1, 0)
+        gains = {gain: getattr(controller, gain) for gain in spans_of(name, plant)}
+        objective = score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, gains)["objective"]
+        numbers = {**gains, "objective": objective}
+        row = {"controller": ROSTER[other].label, "origin": origin_of_gains}
+        rows.append(row | {key: f"{number:.4g}" for key, number in numbers.items()})
+    return pd.DataFrame(rows)
+
+
+def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
     """Return the interval of the search for each gain of a controller, by the gain's name.
 
     An interval is a pair: the value with the smallest magnitude, and the value with the largest
@@ -178,22 +214,18 @@ def spans_of(spec: ControllerSpec, plant: Arguments) -> Mapping[str, tuple[float
 
     Parameters
     ----------
-    spec
-        The controller.
+    name
+        Name of the controller.
     plant
         Arguments of the environment for the plant.
 
     Raises
     ------
-    ValueError
-        If the controller has no gains to search.
     UsageError
         If the plant has no gain or time constant that defines the intervals.
     """
-    if spec.spans is None:
-        raise ValueError(f"{spec.name} has no gains to search")
     with blame("--plant"):
-        return spec.spans(Parameters(**plant))
+        return SPANS[name](Parameters(**plant))
 
 
 def cases(plant: Arguments) -> dict[str, TuningCase]:
@@ -208,40 +240,47 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     parameters = Parameters(**plant)
     amplitude = parameters.setpoint_amplitude / PAPER.setpoint_amplitude
     duration = parameters.setpoint_period / PAPER.setpoint_period
-    zone = sum(parameters.range_of("dead_zone")) / 2.0 / PAPER.range_of("dead_zone")[0]
-    limit = max(abs(parameters.range_of("u_min")[1]), abs(parameters.range_of("u_max")[0]))
-    noise = sum(parameters.range_of("noise_variance")) / 2.0 / PAPER_NOISE
-    if not noise:  # In proportion to the temperatures that the flow reaches, squared.
+    noise = middle(parameters, "noise_variance") / PAPER_NOISE
+    if noise == 0.0:  # Then the noise is in proportion to the squared temperature changes.
         scale, paper_scale = scale_of(parameters), scale_of(PAPER)
         noise = (scale.temperature_range / paper_scale.temperature_range) ** 2
-    scaled: dict[str, TuningCase] = {}
+    factors = {
+        "setpoint": amplitude,
+        "setpoint_amplitude": amplitude,
+        "setpoint_period": duration,
+        "dead_zone": middle(parameters, "dead_zone") / middle(PAPER, "dead_zone"),
+        "noise_variance": noise,
+    }
+    lowest_u_max = parameters.range_of("u_max")[0]
+    highest_u_min = parameters.range_of("u_min")[1]
+    widest_zone = LARGEST_ZONE * max(abs(highest_u_min), abs(lowest_u_max))
+    scaled_cases: dict[str, TuningCase] = {}
     for name, case in CASES.items():
-        arguments = {**plant, "setpoint": "square", **case.arguments}
+        scaled = {key: factors[key] * value for key, value in case.arguments.items()}
+        if "setpoint_period" in scaled:  # must be even
+            scaled["setpoint_period"] = max(2, 2 * round(scaled["setpoint_period"] / 2))
+        if "dead_zone" in scaled:
+            scaled["dead_zone"] = min(scaled["dead_zone"], widest_zone)
         if name == "constant":
-            arguments |= {**QUIET, "setpoint": amplitude * case.arguments["setpoint"]}
-        else:
-            period = case.arguments["setpoint_period"]
-            arguments["setpoint_period"] = max(2, 2 * round(duration * period / 2))  # even
-            arguments["setpoint_amplitude"] *= amplitude
-        if name == "dead zone":
-            arguments["dead_zone"] = min(zone * arguments["dead_zone"], LARGEST_ZONE * limit)
-        if name == "noise":
-            arguments["noise_variance"] *= noise
-        scaled[name] = TuningCase(
-            samples=round(duration * case.samples),
-            first=round(duration * case.first),
-            arguments=arguments,
-        )
-    return scaled
+            scaled |= QUIET
+        samples = round(duration * case.samples)
+        first = round(duration * case.first)
+        arguments = {**plant, "setpoint": "square", **scaled}
+        scaled_cases[name] = TuningCase(samples, first, arguments)
+    return scaled_cases
+
+
+def middle(plant: Parameters, name: str) -> float:
+    """Return the middle of the range of the argument `name` of a plant."""
+    return sum(plant.range_of(name)) / 2.0
 
 
 def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> pd.DataFrame:
     """Try sets of gains of a controller, and return a table with a row for each trial.
 
     A row has the numbers that `score` returns. After an interruption, the rows of the finished
-    trials are in `trials.csv`. The gains of a trial follow from the results of the trials
-    before. So an interrupted search that starts again tries the same gains, and loads the
-    results of finished trials from the folder.
+    trials are in `trials.csv`. A search that starts again tries the same gains as before, and
+    loads the results of finished trials from the folder.
 
     Parameters
     ----------
@@ -261,8 +300,8 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
 
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
     study = optuna.create_study()
-    finished = KeptResults(folder)
-    spans = spans_of(ROSTER[name], plant)
+    kept = KeptResults(folder)
+    spans = spans_of(name, plant)
     magnitudes: Any = {
         gain: optuna.distributions.FloatDistribution(abs(least), abs(most), log=True)
         for gain, (least, most) in spans.items()
@@ -271,18 +310,19 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     try:
         with progress_bar("trials", count) as advance:
             for i in range(count):
+                # With a new sampler in each trial, the gains of a trial depend on the results
+                # of earlier trials only, and not on where the search was interrupted.
                 study.sampler = optuna.samplers.TPESampler(
                     seed=SEED + i, n_startup_trials=STARTUP, multivariate=True
                 )
                 trial = study.ask(magnitudes)
-                row = finished.load(f"trial {i}")
+                row = kept.load(f"trial {i}")
                 if row is None:
-                    gains = {
-                        gain: math.copysign(size, spans[gain][0])
-                        for gain, size in trial.params.items()
-                    }
+                    gains = {}
+                    for gain, magnitude in trial.params.items():
+                        gains[gain] = math.copysign(magnitude, spans[gain][0])
                     row = score(name, plant, runs, FIRST_RUN, gains)
-                    finished.save(f"trial {i}", row)
+                    kept.save(f"trial {i}", row)
                 rows.append(row)
                 study.tell(trial, row["objective"])
                 advance()
@@ -315,21 +355,21 @@ def score(
     dict
         The gains by name; the median over runs of the mean error in each case, degC, by the
         name of the case; "not converged", the share of runs that do not settle at the constant
-        set point; and "objective", degC, which the search minimises: the mean of these medians
-        plus a penalty for runs that do not settle.
+        set point; and "objective", degC, which the search minimises: the mean of the medians,
+        plus a penalty that is proportional to "not converged".
     """
     controller = ROSTER[name].with_gains(gains)
     medians: dict[str, float] = {}
-    failed = 0.0
+    unsettled = 0.0
     for i, (case_name, case) in enumerate(cases(plant).items()):
         seed = first_run + i * SPACING
         trajectory = controller.run(case.arguments, case.samples, runs, seed)
         medians[case_name] = float(np.median(mean_error(trajectory[case.first :])))
         if case_name == "constant":
-            failed = 1.0 - float(settled(trajectory).mean())
+            unsettled = 1.0 - float(settled(trajectory).mean())
     penalty = PENALTY * Parameters(**plant).setpoint_amplitude / PAPER.setpoint_amplitude
-    objective = float(np.mean(list(medians.values()))) + penalty * failed
-    return {**gains, **medians, "not converged": failed, "objective": objective}
+    objective = float(np.mean(list(medians.values()))) + penalty * unsettled
+    return {**gains, **medians, "not converged": unsettled, "objective": objective}
 
 
 main = command("tune", Options, work)

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from datetime import datetime, timedelta
 from functools import cache
 
 import gymnasium
@@ -94,9 +95,23 @@ class TestFit:
 
 
 def table(line="16,5,1", mark=".", start=0):
-    """Return the text of a log whose line 4 is this one, and whose other flows are 3."""
+    """Return the text of a log whose line 4 is `line`, and whose other flows are 3.
+
+    `start` is the time of the first row, in seconds or as a `numpy.datetime64`. `mark` is the
+    decimal mark of the temperatures.
+    """
     rows = [f"{start + 8 * k},3,{k % 7}{mark}25" for k in range(120)]
     return "\n".join(["time,flow,temperature", *rows[:2], line, *rows[3:]])
+
+
+def dated(form, first):
+    """Return the text of a log with dates, of the form for `strftime`, from `first` on."""
+    days = datetime.strptime(first, form)
+    rows = []
+    for k, row in enumerate(table().splitlines()[1:]):
+        date = (days + timedelta(seconds=8 * k)).strftime(form)
+        rows.append(date + row[row.index(",") :])
+    return "\n".join(["time,flow,temperature", *rows])
 
 
 def read(text, folder):
@@ -107,12 +122,17 @@ def read(text, folder):
 WAYS = {
     "decimal commas": table(mark="|").replace(",", ";").replace("|", ","),
     "dates": table("2026-02-01T00:00:15,5,1", start=np.datetime64("2026-01-31T23:59:59")),
+    "dates that begin with the day": dated("%d.%m.%Y %H:%M:%S", "31.12.2025 23:59:00"),
+    "dates that begin with the month": dated("%m/%d/%Y %H:%M:%S", "01/12/2026 23:59:00"),
     "a missing row": table().replace("\n64,3,1.25", ""),
 }
 REFUSED = {
     "line 4: flow looks like thousands: '1,480'": table('16,"1,480" ,1'),
     "line 4: flow looks like thousands: '1.480'": table("16,1.480,1").replace(",", ";"),
     "line 4: a time step of 11.6 s: most time steps are 8": table("19.6,5,1"),
+    "line 10: .* dates begin with the month, write .* 2025-12-31": (
+        dated("%m/%d/%Y %H:%M:%S", "01/02/2026 23:59:00")
+    ),
 }
 # How the temperature of a log becomes one that asks for a warning, by words of the warning.
 DOUBTS = {
@@ -128,6 +148,17 @@ class TestLog:
         log = read(WAYS[way], tmp_path)
         assert log.flow[:4].tolist() == [3.0, 3.0, 5.0, 3.0]
         assert log.temperature[[0, 2, 3, 8, 9]].tolist() == [0.25, 1.0, 3.25, 1.25, 2.25]
+
+    @pytest.mark.parametrize("separator", [";", "\t"])
+    @pytest.mark.parametrize("mark", [".", ","])
+    def test_three_decimals_are_not_taken_for_thousands(self, separator, mark, tmp_path):
+        rows = [("time", "flow", "temperature")]
+        for k in range(120):
+            flow = ("480", f"485{mark}125")[k % 2]
+            rows.append((str(8 * k), flow, f"38{k % 7}{mark}250"))
+        log = read("\n".join(map(separator.join, rows)), tmp_path)
+        assert log.flow[:3].tolist() == [480.0, 485.125, 480.0]
+        assert log.temperature[:3].tolist() == [380.25, 381.25, 382.25]
 
     @pytest.mark.parametrize("complaint", REFUSED)
     def test_what_cannot_be_used_is_named(self, complaint, tmp_path):

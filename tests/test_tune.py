@@ -1,6 +1,7 @@
 """The search for gains, on small budgets."""
 
 import json
+import re
 from unittest.mock import Mock
 
 import numpy as np
@@ -50,6 +51,27 @@ def search(out, runs=2, status=0):
     return pd.read_csv(folder / "trials.csv")
 
 
+def tables_of(page):
+    """Return the rows of each table on a page, with numbers as floats."""
+    tables = []
+    for text in re.findall(r"(?:^\|.*\n)+", page.read_text(), re.MULTILINE):
+        rows = [line.strip("|\n").split("|") for line in text.splitlines()[2:]]
+        tables.append([[number_or_text(cell.strip()) for cell in row] for row in rows])
+    return tables
+
+
+def number_or_text(cell):
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
+
+
+def final_objective(kp, ki):
+    gains = {"kp": kp, "ki": ki}
+    return tune.score("pi", {}, 3, tune.FINAL_FIRST_RUN, gains)["objective"]
+
+
 class TestOtherPlants:
     PLANT = {  # noqa: RUF012
         "b": [0.0912, 0.00808], "setpoint_amplitude": 10.0, "dead_zone": 3.0, "u_max": 20.0,
@@ -61,8 +83,8 @@ class TestOtherPlants:
             expected = Parameters(**tune.CASES[name].arguments)
             assert (case.samples, case.first) == tune.CASES[name][:2]
             assert Parameters(**case.arguments) == expected
-        assert tune.spans_of(ROSTER["pi"], {}) == PI_SPANS
-        assert tune.spans_of(ROSTER["nn"], {}) == NN_SPANS
+        assert tune.spans_of("pi", {}) == PI_SPANS
+        assert tune.spans_of("nn", {}) == NN_SPANS
 
     def test_cases_and_spans_scale_with_the_plant(self):
         cases = tune.cases(self.PLANT)
@@ -74,7 +96,7 @@ class TestOtherPlants:
         assert cases["dead zone"].arguments["dead_zone"] == pytest.approx(3.9)
         assert cases["noise"].arguments["noise_variance"] == pytest.approx(0.8)
         # Twice the gain, of the other sign: half the gains of the controller, likewise.
-        low, high = tune.spans_of(ROSTER["pi"], self.PLANT)["kp"]
+        low, high = tune.spans_of("pi", self.PLANT)["kp"]
         assert (low, high) == pytest.approx((-0.05, -5.0))
 
 
@@ -106,14 +128,17 @@ class TestSearch:
         assert len(trials) == 6
         assert trials["kp"].between(*PI_SPANS["kp"]).all()
         assert "The best" in capsys.readouterr().out
-        page = (tmp_path / "pi/report.md").read_text().splitlines()
-        table = [line for line in page if line.startswith("|")]
-        rows = [[*map(float, line.split("|")[1:-1])] for line in table[2:]]
-        assert len(rows) == 2
-        for kp, ki, *_, objective, in_search in rows:
-            again = tune.score("pi", {}, 3, tune.FINAL_FIRST_RUN, {"kp": kp, "ki": ki})
-            assert objective == pytest.approx(again["objective"], rel=1e-3)
+        best, fixed = tables_of(tmp_path / "pi/report.md")
+        assert len(best) == 2
+        for kp, ki, *_, objective, in_search in best:
+            assert objective == pytest.approx(final_objective(kp, ki), rel=1e-3)
             assert np.isclose(trials["objective"], in_search, rtol=1e-3).any()
+        assert [row[:4] for row in fixed] == [
+            ["PI (1992)", "the paper", 2.2, 0.3],
+            ["PI (searched)", "the search of version 0.1", *SEARCHED_GAINS.values()],
+        ]
+        for _, _, kp, ki, objective in fixed:
+            assert objective == pytest.approx(final_objective(kp, ki), rel=1e-3)
 
     def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch, capsys):
         uninterrupted, judge, calls = search(tmp_path / "whole"), tune.settled, []
@@ -129,7 +154,7 @@ class TestSearch:
         assert "Interrupted" in capsys.readouterr().out
         assert not (tmp_path / "halves/pi").exists()
         assert search(tmp_path / "halves").equals(uninterrupted)
-        assert len(calls) == 5 + 2 + 2  # the first four are kept; the last two are finalists
+        assert len(calls) == 5 + 2 + 2 + 2  # 4 are kept; then 2 finalists, 2 fixed gains
 
     def test_one_that_is_stopped_before_its_first_trial_changes_nothing(
         self, tmp_path, monkeypatch
@@ -152,9 +177,24 @@ class TestSearch:
         assert search(tmp_path, runs=1).equals(search(tmp_path / "other", runs=1))
 
 
-def test_the_pages_of_the_searches_name_the_defaults():
-    pages = (ROOT / f"benchmarks/published/tune_{name}.md" for name in ("nn", "pi"))
-    nn, pi = (page.read_text(encoding="utf-8") for page in pages)
+def test_the_pages_of_the_searches_name_the_gains_of_other_commands():
     paper = DirectNNController()
-    assert f"({', '.join(f'{name} {getattr(paper, name):g}' for name in NN_SPANS)})" in nn
-    assert "gains, {kp:g} and {ki:g}, are".format(**SEARCHED_GAINS) in pi
+    gains = {"nn": [getattr(paper, name) for name in NN_SPANS], "pi": SEARCHED_GAINS.values()}
+    for name, values in gains.items():
+        page = (ROOT / f"benchmarks/published/tune_{name}.md").read_text(encoding="utf-8")
+        assert {f"{value:g}" for value in values} <= set(re.findall(r"\d+(?:\.\d+)?", page))
+
+
+@pytest.mark.parametrize("name", tune.SPANS)
+def test_controllers_of_other_commands_have_the_gains_of_a_search(name, monkeypatch):
+    """The score of the gains is that of the controller itself."""
+    monkeypatch.setattr(tune, "FINAL_RUNS", 2)
+    constant = {"constant": tune.TuningCase(300, 0, {"setpoint": 4.8})}
+    monkeypatch.setattr(tune, "CASES", constant)
+    table = tune.fixed_gains(name, {})
+    for other, objective in zip(tune.FIXED_GAINS[name], table["objective"], strict=True):
+        case = tune.cases({})["constant"]
+        trajectory = ROSTER[other].run(case.arguments, 300, 2, tune.FINAL_FIRST_RUN)
+        unsettled = 1.0 - tune.settled(trajectory).mean()
+        error = np.median(tune.mean_error(trajectory))
+        assert float(objective) == pytest.approx(error + 5.0 * unsettled, rel=1e-3)

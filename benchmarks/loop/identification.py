@@ -1,7 +1,7 @@
 """Fit a plant with a dead zone, a delay and one or two lags to a log, with 95 % intervals.
 
 A log is a table of flows and temperatures, with one row a sample. The model of the temperature
-has three parts:
+is the sum of three parts:
 
 - the flow response: the gain times the response of the delay and the lags to the flow behind
   the dead zone;
@@ -15,7 +15,6 @@ noise xi (a Box-Jenkins model).
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -29,18 +28,23 @@ Array = NDArray[np.float64]
 
 # A second lag, a dead zone and a load step become part of the model only if they improve the
 # fit by these values of `Fit.improvement`, because any part improves a fit a little by chance.
-SECOND_LAG = 10.0
-DEAD_ZONE = 9.0
-LOAD_STEP = 25.0  # the largest, because the time of a step is chosen among hundreds of times
+IMPROVEMENT_BY_SECOND_LAG = 10.0
+IMPROVEMENT_BY_DEAD_ZONE = 9.0
+# This value is the largest, because the time of a step is chosen among hundreds of times.
+IMPROVEMENT_BY_LOAD_STEP = 25.0
 MOST_LOAD_STEPS = 4  # in a model: with many steps, the model could fit any temperature
-# Standard errors are multiplied by this factor, because no plant is quite of the model's form.
-# With this factor, the 95 % intervals of the gain contained the true gain in at least 95 % of
-# the logs of simulated plants.
-SPREAD = 1.5
-GRID = 31  # number of centres, and number of half widths, of a dead zone that are tried
-# Time constants of the lags of a measured disturbance, divided by the plant's larger time
-# constant.
-DISTURBANCE_LAGS = 0.3, 0.9, 3.0
+# A 95 % interval is this number of standard errors wide on either side. Two standard errors
+# would be enough if a plant were exactly of the model's form. With three, the intervals of the
+# gain contained the true gain in at least 95 % of the logs of simulated plants.
+INTERVAL = 3.0
+GRID_POINTS = 31  # number of centres, and number of half widths, of a dead zone that are tried
+# The lags between a measured disturbance and the temperature are unknown. A weighted sum of the
+# step responses of three pairs of lags is close to nearly any smooth step response. Each pair
+# has the plant's larger time constant, and this time constant times one of the ratios.
+DISTURBANCE_RATIOS = 0.3, 0.9, 3.0
+# Terms of the background can be nearly equal, such as three responses to a slow disturbance.
+# Least squares ignores combinations of terms that are smaller than this share of the largest.
+SMALLEST_COMBINATION = 1e-8
 MOST_BLOCKS = 2000  # blocks of rows in a fit; a fit to more blocks takes longer, with no gain
 # The filter that whitens the noise starts from zero. Before this filter has settled, in the
 # first blocks, the prediction errors are as large as the noise, so their weight is small. With
@@ -76,34 +80,40 @@ class DeadZone(NamedTuple):
         return np.where(is_inside, self.centre, flow)
 
 
-def respond(flows: Array, delay: float, slow: float, fast: float = 0.0) -> Array:
-    """Return the output of a delay and one or two lags in series, with gain 1, for some flows.
+def respond(inputs: Array, delay: float, slow: float, fast: float = 0.0) -> Array:
+    """Return the output of a delay and one or two lags in series with gain 1.
 
-    The result has the shape of `flows`. The result is exact for a flow that is constant from
-    one row to the next and was 0 before the first row.
+    The result is exact for inputs that are constant from one row to the next and were 0 before
+    the first row.
 
     Parameters
     ----------
-    flows : array of shape (rows, ...)
-        The flows, or other inputs, in any unit.
+    inputs : array of shape (rows, ...)
+        Flows or other inputs, in any unit.
     delay : float
         The delay in samples, which need not be an integer.
     slow, fast : float
-        The time constants of the two lags in samples; `fast` is below `slow`, or 0 for a single
-        lag.
+        The time constants of the two lags in samples; `fast` differs from `slow`, and is 0 for
+        a single lag.
+
+    Returns
+    -------
+    array of shape (rows, ...)
+        The outputs, in the unit of the inputs.
     """
     if fast > 0.0:  # partial fractions
-        slow_part = slow * respond(flows, delay, slow)
-        fast_part = fast * respond(flows, delay, fast)
+        slow_part = slow * respond(inputs, delay, slow)
+        fast_part = fast * respond(inputs, delay, fast)
         return np.asarray((slow_part - fast_part) / (slow - fast))
-    whole = int(delay)
+    whole_delay = int(delay)
     decay = np.exp(-1.0 / slow)
-    state = lfilter([0.0, 1.0 - decay], [1.0, -decay], flows, axis=0)
-    # A row lies a part of a sample behind the time at which the delayed flow changes.
-    decay_of_part = np.exp(-(1.0 - (delay - whole)) / slow)
-    state_at_rows = decay_of_part * state + (1.0 - decay_of_part) * flows
-    response = np.zeros_like(flows)
-    response[whole + 1 :] = state_at_rows[: max(len(flows) - whole - 1, 0)]
+    state = lfilter([0.0, 1.0 - decay], [1.0, -decay], inputs, axis=0)
+    # A delayed input changes between two rows. From this change to the next row, the state
+    # decays for the part of a sample that is left.
+    decay_to_row = np.exp(-(1.0 - (delay - whole_delay)) / slow)
+    state_at_rows = decay_to_row * state + (1.0 - decay_to_row) * inputs
+    response = np.zeros_like(inputs)
+    response[whole_delay + 1 :] = state_at_rows[: max(len(inputs) - whole_delay - 1, 0)]
     return response
 
 
@@ -142,8 +152,8 @@ class Unknowns(NamedTuple):
     def respond(self, flows: Array) -> Array:
         """Return the output of the delay and the lags, with gain 1, for changes of some flows.
 
-        A change is the difference of a flow from the flow in the first row, with which the
-        plant is taken to have been at rest. `flows` and the result have the shape (rows, ...).
+        A change is a flow minus the flow in the first row. `flows` and the result have the
+        shape (rows, ...).
         """
         return respond(flows - flows[0], self.delay, self.slow, self.fast)
 
@@ -161,53 +171,33 @@ class Fit:
     The rows from `first_row` to `end_row` are divided into blocks of successive rows, and the
     model is fitted to the mean of each block. In a log of fewer than `MOST_BLOCKS` rows, each
     row is a block.
-
-    Attributes
-    ----------
-    log : Log
-        The log.
-    zones : list of DeadZone
-        The dead zones to choose from, those of half width 0 first.
-    unknowns : Unknowns
-        The estimates of gain, delay, time constants and noise model.
-    zone : DeadZone
-        The dead zone of the model.
-    load_steps : tuple of int
-        The rows at which an unmeasured load steps.
-    first_row : int
-        The first row that is fitted. The temperatures in earlier rows depend on flows from
-        before the log.
-    end_row : int, optional
-        The row behind the last one that is fitted; None for the end of the log.
-    standard_errors : Unknowns, optional
-        The standard error of each unknown, after `refined`.
     """
 
     log: Log
-    zones: list[DeadZone]
-    unknowns: Unknowns
-    zone: DeadZone
-    load_steps: tuple[int, ...] = ()
+    zones: list[DeadZone]  # the dead zones to choose from, those of half width 0 first
+    unknowns: Unknowns  # the estimates of gain, delay, time constants and noise model
+    zone: DeadZone  # the dead zone of the model
+    load_steps: tuple[int, ...] = ()  # the rows at which an unmeasured load steps
+    # The first row that is fitted. Earlier temperatures depend on flows from before the log.
     first_row: int = 0
-    end_row: int | None = None
-    standard_errors: Unknowns | None = None
+    end_row: int | None = None  # the row behind the last one that is fitted; None for all rows
+    standard_errors: Unknowns | None = None  # of each unknown, after `refined`
 
-    def whiten(self, terms: Array) -> Array:
+    def whiten(self, signals: Array) -> Array:
         """Return the means of signals over blocks of rows, filtered by D / C.
 
-        The filter D / C turns noise of the noise model C / D into white noise. `terms` has
-        signals in its columns, shape (rows, ...); the result has the shape (blocks, ...). The
-        first `SETTLING_BLOCKS` blocks are multiplied by a small weight, because the filter has
-        not settled there.
+        The filter D / C turns noise of the noise model C / D into white noise. `signals` has
+        the shape (rows, ...), and the result has the shape (blocks, ...). The first
+        `SETTLING_BLOCKS` blocks are multiplied by a small weight.
         """
         unknowns = self.unknowns
         c = stable_polynomial(unknowns.first_of_c, unknowns.second_of_c)
         d = stable_polynomial(unknowns.first_of_d, unknowns.second_of_d)
-        used = terms[self.first_row : self.end_row]
-        size = 1 + len(terms) // MOST_BLOCKS
-        blocks = len(used) // size
-        shape = (blocks, size, *terms.shape[1:])
-        means = used[: blocks * size].reshape(shape).mean(axis=1)
+        fitted = signals[self.first_row : self.end_row]
+        size = 1 + len(signals) // MOST_BLOCKS
+        blocks = len(fitted) // size
+        shape = (blocks, size, *signals.shape[1:])
+        means = fitted[: blocks * size].reshape(shape).mean(axis=1)
         whitened = np.asarray(lfilter(d, c, means, axis=0), np.float64)
         whitened[:SETTLING_BLOCKS] *= SETTLING_WEIGHT
         return whitened
@@ -230,13 +220,13 @@ class Fit:
         terms = [np.ones(len(rows)), np.exp(-elapsed / slow)]
         if fast > 0.0:
             terms.append(np.exp(-elapsed / fast))
-        steps = [(rows >= row).astype(np.float64) for row in self.load_steps]
-        terms += [respond(step, 0.0, slow) for step in steps]
-        # The lags between a disturbance and the temperature are unknown. A weighted sum of the
-        # step responses of three pairs of lags is close to nearly any smooth step response.
+        for step_row in self.load_steps:
+            step = (rows >= step_row).astype(np.float64)
+            terms.append(respond(step, 0.0, slow))
         changes = self.log.disturbances - self.log.disturbances[0]
-        for multiple in DISTURBANCE_LAGS:
-            terms += list(respond(changes, 0.0, slow, multiple * slow).T)
+        for ratio in DISTURBANCE_RATIOS:
+            responses = respond(changes, 0.0, slow, ratio * slow)
+            terms.extend(responses.T)  # a term for each disturbance
         return np.column_stack(terms)
 
     @cached_property
@@ -244,8 +234,9 @@ class Fit:
         """The factors of the background's terms, by linear least squares, shape (terms,)."""
         terms = self.whiten(self.background)
         target = self.whiten(self.log.temperature - self.flow_response)
-        sizes = np.linalg.norm(terms, axis=0) + TINY
-        return np.asarray(lstsq(terms / sizes, target, cond=1e-8)[0] / sizes)
+        lengths = np.linalg.norm(terms, axis=0) + TINY
+        factors, *_ = lstsq(terms / lengths, target, cond=SMALLEST_COMBINATION)
+        return np.asarray(factors / lengths)
 
     @cached_property
     def simulated(self) -> Array:
@@ -273,34 +264,33 @@ class Fit:
         return float(self.errors @ self.errors + TINY)
 
     def improvement(self, squares: Array | float) -> Array:
-        """Return how much better than this fit other fits are: positive where they are better.
+        """Return by how much other fits are better than this fit; negative if they are worse.
 
-        The improvement is twice the logarithm of the ratio of the likelihoods of the other fit
-        and of this fit. `squares` has the sum of squared prediction errors of each other fit,
-        degC^2, and the result has the shape of `squares`.
+        The improvement is twice the logarithm of a ratio: the likelihood of the other fit,
+        divided by the likelihood of this fit. `squares` has the sum of squared prediction
+        errors of each other fit, degC^2, and the result has the shape of `squares`.
         """
         return np.asarray(len(self.errors) * np.log(self.squares / (squares + TINY)))
 
-    def with_candidates(self, target: Array, candidates: Array) -> tuple[Array, Array]:
-        """Try some signals as an additional term of the model, one at a time.
-
-        For each candidate, linear least squares fits the sum of the background and a multiple
-        of the candidate to `target`.
+    def try_candidates(self, target: Array, candidates: Array) -> tuple[Array, Array]:
+        """Fit the background and a multiple of one candidate to a signal, for each candidate.
 
         Parameters
         ----------
         target : array of shape (rows,)
             The signal that is fitted, degC.
         candidates : array of shape (rows, candidates)
-            The signals that are tried, in any unit.
+            The signals that are tried as an additional term of the model, in any unit.
 
         Returns
         -------
         squares : array of shape (candidates,)
             The sum of the squared prediction errors with each candidate, degC^2.
-        coefficients : array of shape (candidates,)
-            The best coefficient of each candidate, degC per unit of the candidate.
+        factors : array of shape (candidates,)
+            The factor of each candidate, degC per unit of the candidate.
         """
+        # Regress the target and the candidates on the background. What the background does not
+        # explain of the target is then fitted by what it does not explain of a candidate.
         base = self.whiten(self.background)
         orthonormal = qr(base / (np.linalg.norm(base, axis=0) + TINY), mode="economic")[0]
         whitened = self.whiten(np.column_stack([target, candidates]))
@@ -317,17 +307,22 @@ class Fit:
 
         The search starts from the unknowns of this fit and finds a local minimum of the sum of
         squared prediction errors. The result also has `standard_errors`. `evaluations` is the
-        largest number of steps of the search.
+        largest number of steps that the search may try.
         """
         longest_delay = len(self.log.flow) / 6.0
-        limit = HIGHEST._replace(delay=longest_delay, log_slow=np.log(2.0 * longest_delay))
-        count = 8 if self.unknowns.ratio > 0.0 else 7  # a single lag has no ratio
-        lowest, highest = np.array([LOWEST, limit])[:, :count]
-        start = np.array(self.unknowns)[:count].clip(lowest + 1e-6, highest - 1e-6)
+        highest = HIGHEST._replace(delay=longest_delay, log_slow=np.log(2.0 * longest_delay))
+        limits = np.array([LOWEST, highest])
+        start = np.array(self.unknowns)
+        if self.unknowns.ratio == 0.0:  # A single lag has no ratio, the last of the unknowns.
+            limits, start = limits[:, :-1], start[:-1]
+
+        def errors(values: Array) -> Array:
+            return replace(self, unknowns=Unknowns(*values)).errors
+
         result = least_squares(
-            lambda values: replace(self, unknowns=Unknowns(*values)).errors,
-            start,
-            bounds=(lowest, highest),
+            errors,
+            start.clip(limits[0] + 1e-6, limits[1] - 1e-6),
+            bounds=limits,
             x_scale="jac",
             diff_step=1e-4,
             ftol=1e-6,
@@ -357,22 +352,22 @@ def possible_zones(
         The centre of the dead zone, t/h; None if the centre is unknown. For an unknown centre,
         the result has centres in the whole range of the flow.
     applied
-        Whether the flow was measured behind the valve. If it was, all half widths are 0.
+        Whether the flow was measured behind the valve, so that all half widths are 0.
     """
-    centres = np.linspace(flow.min(), flow.max(), GRID)
+    centres = np.linspace(flow.min(), flow.max(), GRID_POINTS)
     if operating_flow is not None:
         centres = np.array([operating_flow])
     widest = np.abs(flow - centres.mean()).max()
-    half_widths = np.linspace(0.0, widest, GRID)
+    half_widths = np.linspace(0.0, widest, GRID_POINTS)
     # Flows that differ by less than 2 % of their range count as equal.
     levels = np.unique(np.round(50.0 * (flow - flow.min()) / np.ptp(flow)))
     if len(levels) < 3:  # Two different flows cannot show how wide the dead zone is.
         half_widths = np.array([0.0, widest])
     if applied:
         half_widths = np.zeros(1)
-    if len(half_widths) < GRID:
+    if len(half_widths) < GRID_POINTS:
         centres = centres.mean(keepdims=True)
-    return [DeadZone(centre, width) for width, centre in product(half_widths, centres)]
+    return [DeadZone(centre, width) for width in half_widths for centre in centres]
 
 
 def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
@@ -390,11 +385,13 @@ def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
         start = Unknowns(0.0, 0.0, np.log(slow), first_of_d=-np.exp(-1.0 / slow))
         fit = Fit(log, zones, start, zones[0], end_row=end_row)
         responses = [respond(changes, delay, slow) for delay in delays.tolist()]
-        squares, gains = fit.with_candidates(log.temperature, np.column_stack(responses))
+        squares, gains = fit.try_candidates(log.temperature, np.column_stack(responses))
         best = int(np.argmin(squares))
         start = start._replace(gain=float(gains[best]), delay=float(delays[best]))
         fits.append(replace(fit, unknowns=start).refined(12))
     fit = min(fits, key=lambda fit: fit.squares)
+    # After the delay, the temperature depends on the flows in the log. The margin allows for
+    # errors of the first fit.
     first_row = int(1.3 * fit.unknowns.delay + fit.unknowns.slow / 4.0) + 3
     return replace(fit, first_row=min(first_row, rows // 6))
 
@@ -409,20 +406,21 @@ def try_zones(fit: Fit) -> pd.DataFrame:
     """
     passed = np.column_stack([zone.passed(fit.log.flow) for zone in fit.zones])
     responses = fit.unknowns.respond(passed)
-    squares, gains = fit.with_candidates(fit.log.temperature, responses)
+    squares, gains = fit.try_candidates(fit.log.temperature, responses)
     table = pd.DataFrame(fit.zones)
     return table.assign(gain=gains, improvement=fit.improvement(squares))
 
 
 def with_zone(fit: Fit) -> Fit:
-    """Return `fit` with a new dead zone, the mean of the likeliest ones among `fit.zones`.
+    """Return `fit` with a new dead zone: the mean of the likeliest dead zones in `fit.zones`.
 
-    If the best dead zone improves a fit without a dead zone by less than the constant
-    `DEAD_ZONE`, the half width of the new dead zone is 0. The other unknowns are not changed.
+    If no dead zone improves a fit without a dead zone by `IMPROVEMENT_BY_DEAD_ZONE`, the half
+    width of the new dead zone is 0. The other unknowns are not changed.
     """
     table = try_zones(fit)
     most = table.improvement.max()
-    if most - table.improvement[table.half_width == 0.0].max() < DEAD_ZONE:
+    most_without_zone = table.improvement[table.half_width == 0.0].max()
+    if most - most_without_zone < IMPROVEMENT_BY_DEAD_ZONE:
         return replace(fit, zone=DeadZone(table.centre.mean()))
     likeliest = table[table.improvement > most - 2.0]
     return replace(fit, zone=DeadZone(likeliest.centre.mean(), likeliest.half_width.mean()))
@@ -431,20 +429,20 @@ def with_zone(fit: Fit) -> Fit:
 def with_lags(fit: Fit) -> Fit:
     """Return `fit`, refined with two lags, or with one lag if two lags are hardly better.
 
-    Two lags are hardly better if they improve the fit by at most the constant `SECOND_LAG`.
+    Two lags are hardly better if the improvement is at most `IMPROVEMENT_BY_SECOND_LAG`.
     """
     single = replace(fit, unknowns=fit.unknowns._replace(ratio=0.0)).refined()
     # In a model with two lags, the second lag replaces a part of the delay of one lag.
     start = single.unknowns._replace(delay=0.7 * single.unknowns.delay, ratio=0.4)
     double = replace(single, unknowns=start).refined()
-    return double if single.improvement(double.squares) > SECOND_LAG else single
+    return double if single.improvement(double.squares) > IMPROVEMENT_BY_SECOND_LAG else single
 
 
 def with_load_steps(fit: Fit) -> Fit:
     """Return `fit` with new steps of unmeasured loads, which replace the load steps of `fit`.
 
-    Steps are added one by one, always the step that improves the fit most, while a step
-    improves the fit by at least the constant `LOAD_STEP`, and up to `MOST_LOAD_STEPS`.
+    Up to `MOST_LOAD_STEPS` steps are added one by one. Each added step is the step that
+    improves the fit most, and its improvement is at least `IMPROVEMENT_BY_LOAD_STEP`.
     """
     fit = replace(fit, load_steps=())
     slow = fit.unknowns.slow
@@ -453,11 +451,11 @@ def with_load_steps(fit: Fit) -> Fit:
     step_rows = rows[spacing::spacing]
     steps = (rows[:, np.newaxis] >= step_rows).astype(np.float64)
     responses = respond(steps, 0.0, slow)
+    without_flow = fit.log.temperature - fit.flow_response
     while len(fit.load_steps) < MOST_LOAD_STEPS:
-        without_flow = fit.log.temperature - fit.flow_response
-        squares, _ = fit.with_candidates(without_flow, responses)
+        squares, _ = fit.try_candidates(without_flow, responses)
         best = int(np.argmin(squares))
-        if fit.improvement(squares[best]) < LOAD_STEP:
+        if fit.improvement(squares[best]) < IMPROVEMENT_BY_LOAD_STEP:
             break
         fit = replace(fit, load_steps=(*fit.load_steps, int(step_rows[best])))
     return fit
@@ -489,38 +487,26 @@ def estimates(fit: Fit) -> pd.DataFrame:
     `low` and `high`. `fit` must be a result of `Fit.refined` or `identify`.
     """
     values = fit.unknowns
-    margins = Unknowns(*(2.0 * SPREAD * np.array(fit.standard_errors)))
+    margins = Unknowns(*(INTERVAL * np.array(fit.standard_errors)))
     delay_margin = margins.delay + 0.5  # A log may be half a sample early or late.
+    # An improvement that is smaller by z^2 corresponds to a distance of z standard errors.
+    table = try_zones(fit)
+    likely = table[table.improvement > table.improvement.max() - INTERVAL**2]
+    step = table.half_width.max() / GRID_POINTS
+    narrowest = min(fit.zone.half_width, likely.half_width.min() - step)
+    widest = max(fit.zone.half_width, likely.half_width.max() + step)
     # The dead zones that are nearly as likely as the likeliest one widen the interval of the
     # gain, too.
-    table = try_zones(fit)
-    likely = table[table.improvement > table.improvement.max() - 4.0 * SPREAD**2]
-    lower_gains = np.minimum(likely.gain - values.gain, 0.0)
-    higher_gains = np.maximum(likely.gain - values.gain, 0.0)
-    step = table.half_width.max() / GRID
-    half_width = fit.zone.half_width
-    slow = values.slow * fit.log.sampling_interval
+    gain_below = np.hypot(margins.gain, min(likely.gain.min() - values.gain, 0.0))
+    gain_above = np.hypot(margins.gain, max(likely.gain.max() - values.gain, 0.0))
+    time_constant = values.slow * fit.log.sampling_interval
+    factor = np.exp(margins.log_slow)
+    shortest_delay = max(values.delay - delay_margin, 0.0)
     rows = {
-        "delay": (
-            values.delay,
-            max(values.delay - delay_margin, 0.0),
-            values.delay + delay_margin,
-        ),
-        "dead_zone": (
-            half_width,
-            max(min(half_width, likely.half_width.min() - step), 0.0),
-            max(half_width, likely.half_width.max() + step),
-        ),
-        "gain": (
-            values.gain,
-            values.gain - np.hypot(margins.gain, lower_gains.min()),
-            values.gain + np.hypot(margins.gain, higher_gains.max()),
-        ),
-        "time_constant": (
-            slow,
-            slow * np.exp(-margins.log_slow),
-            slow * np.exp(margins.log_slow),
-        ),
+        "delay": (values.delay, shortest_delay, values.delay + delay_margin),
+        "dead_zone": (fit.zone.half_width, max(narrowest, 0.0), widest),
+        "gain": (values.gain, values.gain - gain_below, values.gain + gain_above),
+        "time_constant": (time_constant, time_constant / factor, time_constant * factor),
     }
     return pd.DataFrame(rows, index=["value", "low", "high"]).T
 

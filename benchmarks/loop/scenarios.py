@@ -6,7 +6,7 @@ A case (a scenario in the code) is a plant, a set point and a length of the runs
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,9 +55,9 @@ SETPOINTS = (
 )
 """The set points of the paper's cases, on the environment's default plant.
 
-The text of the paper describes the plants; only its figures show the set point. Two set points
-are used here: the environment's square wave between +5 and -5 degC, 300 samples each, over two
-periods; and a step to 5 degC.
+Only the figures of the paper show set points. Two set points are used here: the environment's
+square wave, which is +5 degC for 300 samples and -5 degC for the next 300 samples, over two
+periods; and a constant set point of 5 degC.
 """
 
 _CONSTANT = SETPOINTS[1].arguments
@@ -158,21 +158,18 @@ class PlantOptions:
         setpoints: tuple[Scenario, ...] = SETPOINTS
         if {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments):
             setpoints = (Scenario("run", "the set point of the plant's arguments", 1200, {}),)
-        return {
-            setpoint.name: Scenario(
-                setpoint.name,
-                f"{setpoint.title}, {self.name}",
-                setpoint.samples,
-                {**arguments, **setpoint.arguments},
-            )
-            for setpoint in setpoints
-        }
+        cases = {}
+        for setpoint in setpoints:
+            title = f"{setpoint.title}, {self.name}"
+            combined = {**arguments, **setpoint.arguments}
+            cases[setpoint.name] = replace(setpoint, title=title, arguments=combined)
+        return cases
 
     def arguments(self) -> Arguments:
         """Return the arguments of the environment that the user has chosen.
 
-        `--set` overrides `--plant`, which overrides `--preset`. A `UsageError` names the option
-        if an argument of the environment is unknown or invalid, or if the plant is unstable.
+        A `UsageError` names the option if an argument of the environment is unknown or invalid,
+        or if the plant is unstable.
         """
         arguments: Arguments = {}
         if self.preset:
@@ -203,7 +200,7 @@ class PlantOptions:
         return arguments
 
 
-# Ranges of the random plants that `benchmarks.sweep` runs, by argument of the environment. With
+# Ranges of the random plants that `random_design` returns, by argument of the environment. With
 # a gain factor below 0.74, the largest flow could not keep the temperature at 5 degC.
 SPANS = {
     "delay": (6, 36),
@@ -217,10 +214,10 @@ DRIFTS = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_dr
 
 
 def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
-    """Return random plants from a Latin hypercube over the ranges `SPANS`.
+    """Return random plants: for each plant, the values of its arguments, drawn from `SPANS`.
 
-    A plant is a dictionary of arguments of the environment. The second half of the plants
-    drift: the factors of gain and time constant move to other values within `SPANS`.
+    The values form a Latin hypercube. The second half of the plants drift: the factors of gain
+    and time constant change, over `samples` samples, to other values within `SPANS`.
 
     Parameters
     ----------
@@ -233,59 +230,58 @@ def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
     """
     from scipy.stats.qmc import LatinHypercube  # here: slow to import
 
-    # A column for each argument, then one for each factor at the end of its drift.
+    # A plant's row has the values of all arguments, and then the factors at the end of a drift.
     spans = [*SPANS.values(), *(SPANS[factor] for factor in DRIFTS)]
     low, high = np.array(spans).T
     shares = LatinHypercube(len(spans), rng=np.random.default_rng(seed)).random(count)
     rows = (low + shares * (high - low)).round(4).tolist()
     plants: list[Arguments] = []
-    for number, row in enumerate(rows):
+    for i, row in enumerate(rows):
         plant = dict(zip(SPANS, row, strict=False))
         plant["delay"] = round(plant["delay"])
-        if number >= count // 2:
+        if i >= count // 2:
             final_factors = row[len(SPANS) :]
-            for (factor, drift), final in zip(DRIFTS.items(), final_factors, strict=True):
-                plant[drift] = final / plant[factor]
+            for factor, final_factor in zip(DRIFTS, final_factors, strict=True):
+                plant[DRIFTS[factor]] = final_factor / plant[factor]
             plant["drift_samples"] = samples
         plants.append(plant)
     return plants
 
 
-def around(plant: Arguments, design: Sequence[Arguments]) -> list[Arguments]:
-    """Convert random plants that vary the paper's plant to variations of another plant.
+def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Arguments]:
+    """Convert variations of the paper's plant to variations of another plant.
 
-    In delay, dead zone, gain factor and time constant factor, each returned plant differs from
-    `plant` by the ratios by which the plant in `design` differs from the paper's plant. The
-    noise variance keeps its ratio to the square of the temperature change that the flow can
-    cause.
+    If a variation has twice the delay of the paper's plant, then the returned variation has
+    twice the delay of the other plant. Dead zone, gain factor and time constant factor are
+    scaled in the same way. The noise variance is scaled with the square of the temperature
+    change that the flow can cause. All other arguments keep their values.
 
     Parameters
     ----------
-    plant
-        The arguments of the environment for the other plant.
-    design
-        The arguments of the environment for each random plant, as `random_design` returns them.
+    nominal_plant
+        The environment's arguments for the other plant.
+    variations
+        For each variation, the arguments that differ from the paper's plant.
     """
-    scales = _scales(Parameters(**plant))
+    scales = _scales(Parameters(**nominal_plant))
     paper_scales = _scales(Parameters())
-    moved_design: list[Arguments] = []
-    for designed in design:
-        moved: Arguments = {}
-        for name, value in designed.items():
-            factor = scales[name] / paper_scales[name] if name in SPANS else 1.0
-            moved[name] = factor * value
-            if name in ("delay", "drift_samples"):
-                moved[name] = round(moved[name])
-        moved_design.append(moved)
-    return moved_design
+    scaled_variations: list[Arguments] = []
+    for variation in variations:
+        scaled = dict(variation)
+        for name in SPANS:
+            if name in variation:
+                scaled[name] = scales[name] / paper_scales[name] * variation[name]
+        scaled["delay"] = round(scaled["delay"])
+        scaled_variations.append(scaled)
+    return scaled_variations
 
 
 def _scales(plant: Parameters) -> dict[str, float]:
-    """Return the quantity of a plant to which each argument in `SPANS` is proportional.
+    """Return the quantity of a plant to which `around` scales each argument in `SPANS`.
 
     For the noise variance, the quantity is the square of the temperature change by half the
-    range of the flow, degC^2. For any other argument, it is the argument's value, in the middle
-    of the argument's range.
+    range of the flow, degC^2. For any other argument, the quantity is the value of the argument
+    in the nominal plant, which is the plant in the middle of all ranges.
     """
     model = nominal(plant)
     reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0  # degC
