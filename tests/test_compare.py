@@ -218,7 +218,9 @@ class TestReport:
 def test_a_controller_has_one_look_wherever_it_is_listed():
     everyone = looks([*ROSTER, "mine", "yours"])
     assert len(set(everyone.values())) == len(everyone)
-    assert looks(["mine", "pi"]) == {"mine": everyone["mine"], "pi": everyone["pi"]}
+    assert looks(["yours", "pi", "mine"]) == {
+        name: everyone[name] for name in ("yours", "pi", "mine")
+    }
 
 
 @pytest.fixture
@@ -261,7 +263,7 @@ class TestCompare:
             assert f"{error / limit:.2f}" in shown
         # The best comes first.
         assert page.index("| MPC") < page.index("| NN (1992)") < page.index("| PI (1992)")
-        assert "6 gains by the search of version 0.1" in page
+        assert "6 settings by the search of version 0.1" in page
         provenance = json.loads((out / "provenance.json").read_text())
         assert "missing" not in provenance
         assert provenance["seeds"] == [SEED, SEED + 1, SEED + 2]
@@ -405,6 +407,23 @@ class TestCompare:
         assert set(comparison.misfits_of(ROSTER, [slow])) == {
             "nn", "nn-frozen", "pi", "pi-searched", "ppo", "ppo-hard",
         }  # fmt: skip
+
+    def test_few_controllers_are_all_pictured_and_of_many_the_chosen_ones(self):
+        def pictured(names, misfits=()):
+            table = pd.DataFrame()
+            compared = report.Comparison(
+                controllers=ROSTER, results=[], scales={}, runs=table, estimates=table,
+                anticipations={}, misfits=dict.fromkeys(misfits), scores=dict.fromkeys(names),
+            )  # fmt: skip
+            return report.pictured_controllers(compared)
+
+        few = ["mpc", "nn", "self-tuning"]
+        assert pictured(few) == few
+        assert pictured(few, ["nn"]) == ["mpc", "self-tuning"]
+        assert pictured(few, few) == few
+        chosen = {"nn", "pi", "dahlin", "ppo", "neural-smith"}
+        assert set(pictured(list(ROSTER))) == chosen
+        assert set(pictured(list(ROSTER), ["pi"])) == chosen - {"pi"}
 
     def test_the_costs_have_the_robustness_of_the_linear_controllers(self):
         specs = {name: ROSTER[name] for name in ("pi", "pi-simc", "smith", "dahlin", "mpc")}

@@ -30,7 +30,8 @@ LOWEST_SCORE = -0.5
 HIGHEST_SCORE = 0.999
 SCORE_TICKS = LOWEST_SCORE, 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, HIGHEST_SCORE
 SCORE_LABEL = (
-    "score: 0 = idle valve, 1 = least possible error (axis logarithmic in 1 minus the score)"
+    "score: 0 for an idle valve, 1 for the least possible error\n"
+    "(axis logarithmic in 1 minus the score, to show small differences near 1)"
 )
 
 # The look of the band from the 10th to the 90th percentile of the runs.
@@ -55,9 +56,9 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
     path : Path
         The PNG file.
     """
-    marks = marks_of(list(scores))
+    marks = marks_of(list(estimates["agent"].unique()))
     drawn = [score.value for score in scores.values()]
-    height = 1.3 + 0.3 * len(scores)  # inches: title and axis, and the rows
+    height = 1.5 + 0.3 * len(scores)  # inches: title and axis, and the rows
     with open_picture(path, height, scores_finding(scores)) as figure:
         axes = figure.subplots()
         for row, (agent, score) in enumerate(scores.items()):
@@ -77,24 +78,23 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
         _scale_by_score(axes, drawn)
         caption = SCORE_LABEL
         if estimates["scenario"].nunique() > 1:
-            caption += "\nlarge marker and number: mean over the cases; small tick: one case"
+            caption += "\nlarge marker and number: mean over all cases; small tick: one case"
         axes.set_xlabel(caption)
 
 
 def scores_finding(scores: Mapping[str, Estimate]) -> str:
-    """Return the title of the picture of scores: who has the highest and the lowest score.
+    """Return the title of the picture of scores, which names the highest and lowest scores.
 
     `scores` has the overall score of each controller by name, the highest score first.
     """
     names = [label(agent) for agent in scores]
     values = [written(score.value, ".3f") for score in scores.values()]
-    first = f"{names[0]} scores highest with {values[0]}"
-    last = f"{names[-1]} scores lowest with {values[-1]}"
     if len(scores) == 1:
-        return f"{names[0]} scores {values[0]}"
-    if len(scores) == 2:
-        return f"{first}; {last}"
-    return f"{first}, {names[1]} follows with {values[1]}; {last}"
+        return f"{names[0]} has a score of {values[0]}"
+    finding = f"{names[0]} has the highest score ({values[0]})"
+    if len(scores) > 2:
+        finding += f", {names[1]} the second highest ({values[1]})"
+    return f"{finding}, and {names[-1]} the lowest ({values[-1]})"
 
 
 def marks_of(agents: Sequence[str]) -> dict[str, Any]:
@@ -120,19 +120,21 @@ def distance(scores: ArrayLike) -> NDArray[np.float64]:
 def _scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
     """Make the x axis of `axes` logarithmic in 1 minus the score, and label ticks with scores.
 
-    `scores` has all scores that are drawn. If a score lies beyond an end of the axis, the label
-    at this end begins with "<" or ">".
+    `scores` has all scores that are drawn. The axis reaches from the last of `SCORE_TICKS`
+    below all scores to the first tick above them. If a score lies beyond an end of the axis,
+    the label at this end begins with "≤" or "≥".
     """
     labels = [f"{score:g}" for score in SCORE_TICKS]
     if min(scores) < LOWEST_SCORE:
-        labels[0] = f"< {labels[0]}"
+        labels[0] = f"≤ {labels[0]}"
     if max(scores) > HIGHEST_SCORE:
-        labels[-1] = f"> {labels[-1]}"
-    start = 1.15 * float(distance(min(0.0, *scores)))
-    end = float(distance(HIGHEST_SCORE)) / 1.3
+        labels[-1] = f"≥ {labels[-1]}"
+    first = max(int(np.searchsorted(SCORE_TICKS, min(scores), side="right")) - 1, 0)
+    last = min(int(np.searchsorted(SCORE_TICKS, max(scores))), len(SCORE_TICKS) - 1)
+    ticks = distance(SCORE_TICKS[first : last + 1])
     axes.set_xscale("log")
-    axes.set_xticks(distance(SCORE_TICKS), labels)
-    axes.set_xlim(start, end)
+    axes.set_xticks(ticks, labels[first : last + 1])
+    axes.set_xlim(1.15 * ticks[0], ticks[-1] / 1.15)
     axes.xaxis.set_minor_locator(NullLocator())
 
 
@@ -156,7 +158,7 @@ def plot_responses(
         The PNG file.
     """
     agents = errors[responses["agent"].unique()].sort_values(kind="stable").index
-    styles = looks([*agents])
+    styles = looks([*errors.index])
     title = f"{scenario.title}: {responses_finding(errors[agents])}"
     height = 1.2 + 1.25 * len(agents)  # inches: title and legend, and the rows
     with open_picture(path, height, title) as figure:
@@ -172,7 +174,11 @@ def plot_responses(
             axes.set_xlim(0.0, responses["time_s"].max() / 60.0)
         entries = _legend_of_responses(responses, scenario.parameters)
         figure.legend(
-            list(entries.values()), list(entries), loc="outside lower center", ncols=4
+            list(entries.values()),
+            list(entries),
+            loc="outside lower center",
+            ncols=4,
+            columnspacing=1.5,
         )
 
 
@@ -186,8 +192,8 @@ def responses_finding(errors: pd.Series[float]) -> str:
     worst = str(errors.index[-1])
     if best == worst:
         return f"the mean error of {label(best)} is {errors[best]:.3f} °C"
-    multiple = errors[worst] / errors[best]
-    return f"the mean error of {label(worst)} is {multiple:.1f} times that of {label(best)}"
+    ratio = errors[worst] / errors[best]
+    return f"{label(worst)} has {ratio:.1f} times the mean error of {label(best)}"
 
 
 def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
@@ -244,11 +250,11 @@ def _legend_of_responses(responses: pd.DataFrame, plant: Parameters) -> dict[str
     band = Patch(color="black", **BAND)
     entries: dict[str, Any] = {"set point": Line2D([], [], **SETPOINT)}
     if runs_differ:
-        entries["first run; 10th to 90th percentile of all"] = (band, run)
+        entries["line: first run; band: 10th to 90th percentile"] = (band, run)
     elif plant.setpoint == "random":
         entries["first run"] = run
     smallest = "smallest " if "dead_zone" in plant.ranges else ""
     entries[f"{smallest}dead zone"] = Patch(**DEAD_ZONE)
     widest = "widest " if {"u_min", "u_max"} & set(plant.ranges) else ""
-    entries[f"{widest}limits"] = Line2D([], [], **LIMIT)
+    entries[f"{widest}flow limits"] = Line2D([], [], **LIMIT)
     return entries

@@ -25,47 +25,64 @@ from benchmarks.loop.rollout import CHANGE, START
 from benchmarks.loop.scenarios import Scenario
 
 SCORE = (
-    "The score of a controller is the mean of its scores in the cases, with a 95 % interval. "
-    "The valve travel is the mean over all runs. The last columns have the score in each "
-    "case."
+    "The error of a run is the mean of |e| over the samples, where e is the set point minus "
+    "the temperature. An idle valve keeps the flow at 0 t/h. The score says which share of the "
+    "way from the error of an idle valve to the least possible error a controller covers. "
+    "The column 'score' has the mean score over all cases, with a 95 % confidence "
+    "interval, and the columns of the cases have the score in each case. The valve travel is "
+    "the sum of all changes of the applied flow in a run, as a mean over all runs."
 )
-BOUND = (
-    "The first row is the least possible error of a controller without foresight. The mark * "
-    "means that the plant has settled before each change of the set point. In a case with "
-    "this mark, a controller that knows when the set point changes can have a smaller error, "
-    "down to the error in the second row."
+RATIO = (
+    "An error ratio of 1.00 is best. The first row has the least possible error of a "
+    "controller that does not know future set points, and the second row has the least "
+    "possible error of a controller that knows them. The mark * means that the plant settles "
+    "before each change of the set point, and that the error in the first row assumes that "
+    "each change comes as a surprise. In a case with the mark *, a controller that has learnt "
+    "when the set point changes can have an error ratio below 1.00."
 )
 ANTICIPATES = (
     "‡ The controller moves the valve before the square wave changes. Its score in this case "
     "is the score in runs with the same seeds in which nobody can foresee the changes."
 )
 SURPRISED = (
-    "These controllers move the valve before the square wave changes. The column 'moved "
-    "before the change' has the share of a change that the temperature has made before it can "
-    "respond to the change. A controller that knows the period of the square wave can reach "
-    "the error with foresight. The last column is the error ratio in runs whose changes "
-    "nobody can foresee."
+    "The controllers in this table move the valve before the square wave changes. The column "
+    "'moved before the change' has the share of a set-point change that the temperature makes "
+    "before it can respond to the change. The columns 'least possible' and 'with foresight' "
+    "have the least possible errors of controllers that do not know future set points, and of "
+    "controllers that know them. The last column has the error ratio in runs in which nobody "
+    "can foresee the changes."
 )
 PAIRED = (
-    "If a difference is below 0 °C, the controller has a smaller error than the controller in "
-    "the heading. The percentage is the share of runs in which its error is smaller."
+    "The reference is the controller that was named first, here {reference}. A cell has the "
+    "error of a controller minus the error of the reference in the same run, in °C: the mean "
+    "over the runs, with a 95 % confidence interval. A negative difference means that the "
+    "controller has the smaller error. The percentage is the share of the runs in which the "
+    "controller has the smaller error."
 )
 HARD = (
-    "The mean error is the sum of the contributions of three parts of a run. All columns are "
-    "in °C."
+    "The mean error on the preset hard, in °C, is the sum of three contributions: those of the "
+    f"first {START} samples of a run, of the {CHANGE} samples after each later change of the "
+    "set point, and of the remaining samples."
 )
-ROBUST = (
-    "The loop of a linear controller has an Ms, which is the largest magnitude of its "
-    "sensitivity function, and a range of delays with which the loop is stable. Both are "
-    "computed for the nominal plant of the first case, away from the dead zone and the "
-    "limits. PI (SIMC), Smith and Dahlin are tuned to the same Ms."
+COSTS = (
+    "The column 'prior knowledge' says what a controller knows about the plant before a run, "
+    "and the column 'searched or trained' says how its settings or weights were found; 1 M "
+    "samples are a million samples. Ms is the maximum sensitivity of a control loop, the "
+    "largest magnitude of its sensitivity function: the lower Ms is, the more robust is the "
+    "loop. Ms and the range of delays with which the loop is stable are given for linear "
+    "controllers, with the nominal plant of the first case, without dead zone and limits."
 )
+CASES = (
+    "Each case is the environment MiddlePoint-v0 with the arguments in the last column; all "
+    "other arguments have their default values."
+)
+MOST_ROWS = 8  # largest number of controllers in a picture of temperature and flow over time
 MISFIT = "†"  # marks controllers that were made for another plant
 PARTS = {  # the columns of a part of the mean error, and of the mean error
     "mae_start": f"first {START} samples",
     "mae_changes": f"{CHANGE} samples after later changes",
-    "mae_steady": "the rest",
-    "mae": "together",
+    "mae_steady": "remaining samples",
+    "mae": "mean error",
 }
 
 
@@ -171,8 +188,8 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
     """Draw the scores, and the temperature and flow over time in each scenario.
 
     Controllers that do not fit the plants have no scores in the picture. Temperature and flow
-    are drawn for the controllers whose record has `pictured` true, or for all controllers if
-    there is no such record.
+    are drawn for `pictured_controllers`, or for all controllers with results in the scenario if
+    none of these has results.
 
     Parameters
     ----------
@@ -186,15 +203,12 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
     """
     from benchmarks.compare import plots  # imported here, as matplotlib is slow to import
 
-    runs = comparison.runs
     misfits = comparison.misfits
-    fitting = {
-        name: comparison.scores[name] for name in comparison.scores if name not in misfits
-    }
+    fitting = {name: score for name, score in comparison.scores.items() if name not in misfits}
     if fitting:
         plots.plot_scores(fitting, comparison.estimates, folder / "scores.png")
-    pictured = [name for name in fitting if comparison.controllers[name].pictured]
-    errors = runs.groupby(["scenario", "agent"])["mae"].mean()
+    pictured = pictured_controllers(comparison)
+    errors = comparison.runs.groupby(["scenario", "agent"])["mae"].mean()
     for name, scale in comparison.scales.items():
         rows = responses[name]
         if rows["agent"].isin(pictured).any():
@@ -202,11 +216,32 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
         plots.plot_responses(rows, errors[name], scale.scenario, folder / f"{name}.png")
 
 
+def pictured_controllers(comparison: Comparison) -> list[str]:
+    """Return the controllers whose temperature and flow are drawn over time, the best first.
+
+    They are the controllers that fit the plants. If there are more than `MOST_ROWS`, they are
+    only those whose record has `pictured` true.
+    """
+    misfits = comparison.misfits
+    fitting = [name for name in comparison.scores if name not in misfits]
+    pictured = [name for name in fitting if comparison.controllers[name].pictured]
+    if len(fitting) > MOST_ROWS and pictured:
+        return pictured
+    return fitting or list(comparison.scores)
+
+
 def sections(comparison: Comparison) -> list[Section]:
     """Return the sections of the report whose tables have at least one row."""
     reference = label(str(comparison.runs["agent"].iloc[0]))
     first_scale = next(iter(comparison.scales.values()))
     titles = {name: scale.scenario.title for name, scale in comparison.scales.items()}
+    case_texts = [CASES]
+    if any("Figs" in title for title in titles.values()):
+        case_texts.append("Figs are the figures of the paper by Cui and Shin (1992).")
+    pictured = pictured_controllers(comparison)
+    if len(pictured) < len(comparison.controllers):
+        names = ", ".join(label(name) for name in pictured)
+        case_texts.append(f"The pictures show these controllers: {names}.")
     candidates = [
         Section(
             "Score: 0 for an idle valve, 1 for the least possible error",
@@ -214,38 +249,37 @@ def sections(comparison: Comparison) -> list[Section]:
             score_table(
                 comparison.runs, comparison.estimates, comparison.scores, comparison.misfits
             ),
-            pictures={
-                "scores.png": "The score of each controller, and a small tick for each case"
-            },
+            pictures={"scores.png": "The score of each controller, and its score in each case"},
         ),
         Section(
-            "Error ratio: mean error / least possible error, with its 95 % interval",
-            [BOUND],
+            "Error ratio: mean error / least possible error, with a 95 % confidence interval",
+            [RATIO],
             ratio_table(comparison.estimates, comparison.scales, list(comparison.scores)),
         ),
         Section(
-            "Anticipation: who moves before the square wave changes",
+            "Anticipation: controllers that act before the square wave changes",
             [SURPRISED],
             anticipation_table(comparison.anticipations, comparison.estimates),
         ),
         Section(
-            f"Difference to {reference} (°C), 95 % interval",
-            [PAIRED],
+            f"Difference to the error of the reference: {reference}",
+            [PAIRED.format(reference=reference)],
             difference_table(comparison.estimates),
         ),
         Section(
-            "Where the error arises: hard",
+            "Where the error arises on the preset hard",
             [HARD],
             parts_table(comparison.runs),
         ),
         Section(
             "What each controller knows and costs",
-            [ROBUST],
+            [COSTS],
             costs_table(comparison.results, comparison.controllers, first_scale.scenario),
         ),
         Section(
             "Cases",
-            table=pd.DataFrame(titles.items(), columns=["case", "what it is"]),
+            case_texts,
+            cases_table([scale.scenario for scale in comparison.scales.values()]),
             pictures={
                 f"{name}.png": f"Temperature and applied flow over time: {title}"
                 for name, title in titles.items()
@@ -354,10 +388,10 @@ def anticipation_table(anticipations: Anticipations, estimates: pd.DataFrame) ->
                 "controller": label(row["agent"]),
                 "moved before the change (%)": f"{anticipation.movement.scaled(100.0):.0f}",
                 "mean error (°C)": f"{row['mean'].value:.3f}",
-                "without foresight": f"{row['limit']:.3f}",
-                "with foresight": f"{row['preview']:.3f}",
+                "least possible (°C)": f"{row['limit']:.3f}",
+                "with foresight (°C)": f"{row['preview']:.3f}",
                 "error ratio": f"{row['ratio'].value:.2f}",
-                "error ratio where changes surprise": f"{anticipation.ratio:.2f}",
+                "error ratio without foresight": f"{anticipation.ratio:.2f}",
             }
         )
     return pd.DataFrame(rows)
@@ -407,6 +441,21 @@ def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
     means = runs[runs["scenario"] == "hard"].groupby("agent")[list(PARTS)].mean()
     texts = means.sort_values("mae").map("{:.3f}".format)
     return texts.rename(index=label, columns=PARTS).rename_axis("controller").reset_index()
+
+
+def cases_table(scenarios: Sequence[Scenario]) -> pd.DataFrame:
+    """Return a table of texts that describes scenarios, with a row for each scenario."""
+    rows = []
+    for scenario in scenarios:
+        arguments = [f"{name}={value}" for name, value in scenario.arguments.items()]
+        row = {
+            "case": scenario.name,
+            "description": scenario.title,
+            "length (samples)": f"{scenario.samples:,}",
+            "arguments": ", ".join(arguments) or "none",
+        }
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def costs_table(

@@ -49,7 +49,9 @@ SETPOINT: Any = {"color": "black", "linestyle": "--", "linewidth": 0.8}
 DEAD_ZONE: Any = {"color": "0.5", "alpha": 0.2, "linewidth": 0}
 LIMIT: Any = {"color": "0.4", "linestyle": ":", "linewidth": 1.0}
 
-RATIO_LABEL = "error / least possible error\n(axis logarithmic in the ratio minus 1)"
+RATIO_LABEL = (
+    "error ratio: mean error / least possible error\n(axis logarithmic in the ratio minus 1)"
+)
 # The smallest error ratio that is drawn; smaller ratios are drawn at this ratio. An error ratio
 # of 1 would lie at minus infinity on an axis that is logarithmic in the ratio minus 1.
 RATIO_FLOOR = 1.001
@@ -84,8 +86,9 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
 
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, height))
-        sentence = textwrap.fill(title[0].upper() + title[1:], TITLE_CHARACTERS)
-        figure.suptitle(sentence, x=0.015, ha="left", fontsize=10, weight="bold")
+        sentence = title[0].upper() + title[1:]
+        lines = textwrap.wrap(sentence, TITLE_CHARACTERS, break_on_hyphens=False)
+        figure.suptitle("\n".join(lines), x=0.015, ha="left", fontsize=10, weight="bold")
         yield figure
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()  # `Figure.savefig` would draw twice because of the layout.
@@ -194,14 +197,14 @@ def scale_by_ratio(axes: Axes, direction: Literal["x", "y"], ratios: ArrayLike) 
         The axis of the panel, "x" or "y".
     ratios
         All error ratios in the panel, which set the ends of the axis. If one of the ratios is
-        below `RATIO_FLOOR`, the label of the lowest tick is "< 1.001" in place of "1.001".
+        below `RATIO_FLOOR`, the label of the lowest tick is "≤ 1.001" in place of "1.001".
     """
     from matplotlib import ticker
 
     values = excess(ratios)
     labels = [f"{ratio:g}" for ratio in RATIO_TICKS]
     if np.min(ratios) < RATIO_FLOOR:
-        labels[0] = f"< {labels[0]}"
+        labels[0] = f"≤ {labels[0]}"
     limits = (values.min() / 1.4, values.max() * 1.4)
     axes.set(**{f"{direction}scale": "log", f"{direction}lim": limits})
     axis = getattr(axes, f"{direction}axis")

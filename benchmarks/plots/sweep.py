@@ -101,7 +101,7 @@ def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
             # The controller with the largest errors is the uppermost line.
             figure.legend(loc="outside right center", reverse=True)
         axes.set_xlim(0.0, 100.0)
-        axes.set_xlabel("share of the plants (%), sorted by the error of each controller")
+        axes.set_xlabel("share of the plants (%), sorted by the error ratio of each controller")
         axes.set_ylabel(RATIO_LABEL)
 
 
@@ -150,7 +150,7 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
             location="bottom",
             aspect=60,
         )
-        bar.set_label("error / least possible error")
+        bar.set_label("error ratio: mean error / least possible error")
         bar.set_ticks(CLASSES, labels=[f"{ratio:g}" for ratio in CLASSES])
 
 
@@ -175,7 +175,7 @@ def map_finding(plants: pd.DataFrame) -> str:
     if len(names) > 1:
         finding += f", {names[1]} on {percentages[1]}"
     if len(names) > 2:
-        finding += "; no other controller is on more"
+        finding += f", and every other controller on at most {percentages[2]}"
     return finding
 
 
@@ -209,9 +209,9 @@ def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
     """
     entries: dict[str, Artist] = {"the nominal plant": Line2D([], [], **NOMINAL)}
     if (plants["oscillates"] >= OFTEN).any():
-        entries["oscillates"] = Line2D([], [], **OSCILLATES)
+        entries["oscillation in most runs"] = Line2D([], [], **OSCILLATES)
     if (plants["useless"] >= OFTEN).any():
-        entries["no better than idle"] = Patch(color=USELESS)
+        entries["idle valve as good"] = Patch(color=USELESS)
     if plants["ratio"].isna().any():
         entries["least possible error unknown"] = Patch(color=NO_RATIO)
     return entries
