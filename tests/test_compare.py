@@ -106,12 +106,23 @@ def some_runs(**errors):
     )
 
 
+def a_comparison(**results):
+    """Return a comparison with some results, and empty ones in place of the others."""
+    empty = pd.DataFrame()
+    return report.Comparison(
+        **{
+            "controllers": ROSTER, "results": [], "scales": {}, "runs": empty,
+            "estimates": empty, "anticipations": {}, "misfits": {}, "scores": {}, **results,
+        }
+    )  # fmt: skip
+
+
 class TestEstimates:
     def test_by_hand(self):
         scale = scale_of(SCENARIOS["constant"], 3, SEED)
         limit = scale.least.value
         runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
-        found = estimate(runs.assign(scenario="constant"), {"constant": scale})
+        found = estimate(runs.assign(scenario="constant"), {"constant": scale}, {})
         nn, ppo_ = found.to_dict("records")
         assert (nn["mean"].value, nn["limit"]) == (2.0, limit)
         assert nn["ratio"].value == pytest.approx(2.0 / limit)
@@ -130,10 +141,12 @@ class TestEstimates:
             runs = some_runs(a=[[idle, half]], b=[[least, half]])
             rows.append(runs.assign(scenario=name, total_variation=12.0))
         runs = pd.concat(rows)
-        found = estimate(runs, scales)
-        scores = ranked(found)
+        found = estimate(runs, scales, {})
+        scores = ranked(found, {})
         assert scores["b"].value == pytest.approx(0.75)
-        best, other = report.score_table(runs, found, scores).to_dict("records")
+        best, other = report.score_table(
+            a_comparison(runs=runs, estimates=found, scores=scores)
+        ).to_dict("records")
         assert (best["controller"], best["travel (t/h)"], best["square"]) == (
             "b", "12", "0.75",
         )  # fmt: skip
@@ -410,12 +423,8 @@ class TestCompare:
 
     def test_few_controllers_are_all_pictured_and_of_many_the_chosen_ones(self):
         def pictured(names, misfits=()):
-            table = pd.DataFrame()
-            compared = report.Comparison(
-                controllers=ROSTER, results=[], scales={}, runs=table, estimates=table,
-                anticipations={}, misfits=dict.fromkeys(misfits), scores=dict.fromkeys(names),
-            )  # fmt: skip
-            return report.pictured_controllers(compared)
+            scores, reasons = dict.fromkeys(names), dict.fromkeys(misfits)
+            return a_comparison(scores=scores, misfits=reasons).pictured
 
         few = ["mpc", "nn", "self-tuning"]
         assert pictured(few) == few

@@ -1,12 +1,13 @@
 """Write the tables, pictures and report of a comparison of controllers in scenarios."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from benchmarks.compare import plots
 from benchmarks.compare.comparison import (
     Anticipations,
     Result,
@@ -122,6 +123,24 @@ class Comparison:
     misfits: Mapping[str, str]
     scores: Mapping[str, Estimate]
 
+    @property
+    def ranked(self) -> list[str]:
+        """The names of the controllers that fit all plants, the best first."""
+        return [name for name in self.scores if name not in self.misfits]
+
+    @property
+    def pictured(self) -> list[str]:
+        """The names of the controllers that are drawn over time, the best first.
+
+        They are the `ranked` controllers, or all controllers if none is ranked. If there are
+        more than `MOST_ROWS`, they are only those whose record has `pictured` true.
+        """
+        names = self.ranked or list(self.scores)
+        chosen = [name for name in names if self.controllers[name].pictured]
+        if len(names) > MOST_ROWS and chosen:
+            return chosen
+        return names
+
 
 def write(
     results: Sequence[Result],
@@ -154,10 +173,8 @@ def write(
         tables = [result.responses for result in results if result.scenario == name]
         responses[name] = pd.concat(tables)
         write_numbers(folder / f"{name}.csv", responses[name])
-    scale_of = {}
-    for scale in scales:
-        if scale.scenario.name in responses:
-            scale_of[scale.scenario.name] = scale
+    scale_of = {scale.scenario.name: scale for scale in scales}
+    scale_of = {name: scale for name, scale in scale_of.items() if name in responses}
     runs = runs[runs["scenario"].isin(list(scale_of))]
     if runs.empty:
         return
@@ -187,10 +204,6 @@ def write(
 def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:
     """Draw the scores, and the temperature and flow over time in each scenario.
 
-    Controllers that do not fit the plants have no scores in the picture. Temperature and flow
-    are drawn for `pictured_controllers`, or for all controllers with results in the scenario if
-    none of these has results.
-
     Parameters
     ----------
     comparison
@@ -201,70 +214,42 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
     folder
         The folder of the PNG files.
     """
-    from benchmarks.compare import plots  # imported here, as matplotlib is slow to import
-
-    misfits = comparison.misfits
-    fitting = {name: score for name, score in comparison.scores.items() if name not in misfits}
-    if fitting:
-        plots.plot_scores(fitting, comparison.estimates, folder / "scores.png")
-    pictured = pictured_controllers(comparison)
+    scores = {name: comparison.scores[name] for name in comparison.ranked}
+    if scores:
+        plots.plot_scores(scores, comparison.estimates, folder / "scores.png")
     errors = comparison.runs.groupby(["scenario", "agent"])["mae"].mean()
     for name, scale in comparison.scales.items():
         rows = responses[name]
-        if rows["agent"].isin(pictured).any():
-            rows = rows[rows["agent"].isin(pictured)]
-        plots.plot_responses(rows, errors[name], scale.scenario, folder / f"{name}.png")
-
-
-def pictured_controllers(comparison: Comparison) -> list[str]:
-    """Return the controllers whose temperature and flow are drawn over time, the best first.
-
-    They are the controllers that fit the plants. If there are more than `MOST_ROWS`, they are
-    only those whose record has `pictured` true.
-    """
-    misfits = comparison.misfits
-    fitting = [name for name in comparison.scores if name not in misfits]
-    pictured = [name for name in fitting if comparison.controllers[name].pictured]
-    if len(fitting) > MOST_ROWS and pictured:
-        return pictured
-    return fitting or list(comparison.scores)
+        rows = rows[rows["agent"].isin(comparison.pictured)]
+        if not rows.empty:  # The tasks of all pictured controllers may have failed.
+            plots.plot_responses(rows, errors[name], scale.scenario, folder / f"{name}.png")
 
 
 def sections(comparison: Comparison) -> list[Section]:
-    """Return the sections of the report whose tables have at least one row."""
+    """Return the sections of the report, without those whose table has no row."""
     reference = label(str(comparison.runs["agent"].iloc[0]))
-    first_scale = next(iter(comparison.scales.values()))
-    titles = {name: scale.scenario.title for name, scale in comparison.scales.items()}
-    case_texts = [CASES]
-    if any("Figs" in title for title in titles.values()):
-        case_texts.append("Figs are the figures of the paper by Cui and Shin (1992).")
-    pictured = pictured_controllers(comparison)
-    if len(pictured) < len(comparison.controllers):
-        names = ", ".join(label(name) for name in pictured)
-        case_texts.append(f"The pictures show these controllers: {names}.")
+    scenarios = [scale.scenario for scale in comparison.scales.values()]
     candidates = [
         Section(
             "Score: 0 for an idle valve, 1 for the least possible error",
             [SCORE, *notes(comparison)],
-            score_table(
-                comparison.runs, comparison.estimates, comparison.scores, comparison.misfits
-            ),
+            score_table(comparison),
             pictures={"scores.png": "The score of each controller, and its score in each case"},
         ),
         Section(
             "Error ratio: mean error / least possible error, with a 95 % confidence interval",
             [RATIO],
-            ratio_table(comparison.estimates, comparison.scales, list(comparison.scores)),
+            ratio_table(comparison),
         ),
         Section(
             "Anticipation: controllers that act before the square wave changes",
             [SURPRISED],
-            anticipation_table(comparison.anticipations, comparison.estimates),
+            anticipation_table(comparison),
         ),
         Section(
             f"Difference to the error of the reference: {reference}",
             [PAIRED.format(reference=reference)],
-            difference_table(comparison.estimates),
+            difference_table(comparison),
         ),
         Section(
             "Where the error arises on the preset hard",
@@ -274,23 +259,23 @@ def sections(comparison: Comparison) -> list[Section]:
         Section(
             "What each controller knows and costs",
             [COSTS],
-            costs_table(comparison.results, comparison.controllers, first_scale.scenario),
+            costs_table(comparison.results, comparison.controllers, scenarios[0]),
         ),
         Section(
             "Cases",
-            case_texts,
-            cases_table([scale.scenario for scale in comparison.scales.values()]),
+            notes_on_cases(comparison, scenarios),
+            cases_table(scenarios),
             pictures={
-                f"{name}.png": f"Temperature and applied flow over time: {title}"
-                for name, title in titles.items()
+                f"{scenario.name}.png": f"Temperature and flow over time: {scenario.title}"
+                for scenario in scenarios
             },
         ),
     ]
     marks = {label(name): f"{label(name)} {MISFIT}" for name in comparison.misfits}
     filled = []
     for section in candidates:
-        table = section.table
-        if table is None or table.empty:
+        table: Any = section.table
+        if table.empty:
             continue
         if "controller" in table:
             table["controller"] = table["controller"].replace(marks)
@@ -299,7 +284,10 @@ def sections(comparison: Comparison) -> list[Section]:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return sentences on controllers that are not ranked, or ranked by surprising runs."""
+    """Return sentences on controllers that are not ranked, or ranked by surprising runs.
+
+    The notes of users' own controllers, such as on a missing environment, come first.
+    """
     texts = {
         str(policy["note"])
         for result in comparison.results
@@ -315,104 +303,92 @@ def notes(comparison: Comparison) -> list[str]:
     return [*sorted(texts), *not_ranked]
 
 
-def score_table(
-    runs: pd.DataFrame,
-    estimates: pd.DataFrame,
-    scores: Mapping[str, Estimate],
-    misfits: Collection[str] = (),
-) -> pd.DataFrame:
+def notes_on_cases(comparison: Comparison, scenarios: Sequence[Scenario]) -> list[str]:
+    """Return the paragraphs above the table of cases: what it has, and who is in the pictures.
+
+    `scenarios` are all scenarios of the report.
+    """
+    texts = [CASES]
+    if any("Figs" in scenario.title for scenario in scenarios):
+        texts.append("Figs are the figures of the paper by Cui and Shin (1992).")
+    if len(comparison.pictured) < len(comparison.controllers):
+        names = ", ".join(label(name) for name in comparison.pictured)
+        texts.append(f"The pictures show these controllers: {names}.")
+    return texts
+
+
+def score_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts with the scores and the mean valve travel of each controller.
 
-    Parameters
-    ----------
-    runs
-        A row for each run, as in `comparison.Result`.
-    estimates
-        The table of `comparison.estimate`.
-    scores
-        The overall score of each controller by name, in the order of the rows of the result.
-    misfits
-        The names of controllers that do not fit the plants, which are shown as "not ranked".
+    The controllers have the order of their overall scores. A controller that does not fit the
+    plants is "not ranked".
     """
-    agents = list(scores)
+    estimates = comparison.estimates
+    agents = list(comparison.scores)
     cells = estimates["scores"].map(lambda scores: written(scores.mean(), ".2f"))
     table = _by_agent(estimates, cells + estimates["mark"], agents)
-    travels = runs.groupby(["agent", "scenario"])["total_variation"].mean()
+    travels = comparison.runs.groupby(["agent", "scenario"])["total_variation"].mean()
     overall = []
-    for agent, score in scores.items():
-        overall.append("not ranked" if agent in misfits else f"{score:.3f}")
+    for agent, score in comparison.scores.items():
+        overall.append("not ranked" if agent in comparison.misfits else f"{score:.3f}")
     table.insert(1, "score", overall)
     table.insert(2, "travel (t/h)", [f"{travels[agent].mean():,.0f}" for agent in agents])
     return table
 
 
-def ratio_table(
-    estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
-) -> pd.DataFrame:
+def ratio_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts with least possible errors and error ratios in each scenario.
 
     The first two rows have the least possible errors without and with knowledge of future set
-    points, degC. The other rows have the error ratios of the controllers.
-
-    Parameters
-    ----------
-    estimates
-        The table of `comparison.estimate`.
-    scales
-        The least possible errors in each scenario, by the name of the scenario.
-    agents
-        The names of the controllers, in the order of the rows.
+    points, degC. Each other row has the error ratios of a controller.
     """
     bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
-    for name, scale in scales.items():
+    for name, scale in comparison.scales.items():
         mark = "*" if scale.least.kind == "reference" else ""
         bounds[name] = [f"{scale.least.value:.3f}{mark}", f"{scale.preview:.3f}"]
+    estimates = comparison.estimates
     cells = estimates["ratio"].map("{:.2f}".format) + estimates["mark"]
-    return pd.concat([bounds, _by_agent(estimates, cells, agents)], ignore_index=True)
+    ratios = _by_agent(estimates, cells, list(comparison.scores))
+    return pd.concat([bounds, ratios], ignore_index=True)
 
 
-def anticipation_table(anticipations: Anticipations, estimates: pd.DataFrame) -> pd.DataFrame:
+def anticipation_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts on the controllers that act before a square wave changes.
 
-    There is a row for each scenario and controller in `anticipations`. `estimates` is the table
-    of `comparison.estimate`.
+    There is a row for each scenario and controller in `comparison.anticipations`.
     """
+    estimates = comparison.estimates
     rows = []
-    for row in estimates.to_dict("records"):
-        anticipation = anticipations.get((row["scenario"], row["agent"]))
-        if anticipation is None:
-            continue
-        rows.append(
-            {
-                "case": row["scenario"],
-                "controller": label(row["agent"]),
-                "moved before the change (%)": f"{anticipation.movement.scaled(100.0):.0f}",
-                "mean error (°C)": f"{row['mean'].value:.3f}",
-                "least possible (°C)": f"{row['limit']:.3f}",
-                "with foresight (°C)": f"{row['preview']:.3f}",
-                "error ratio": f"{row['ratio'].value:.2f}",
-                "error ratio without foresight": f"{anticipation.ratio:.2f}",
-            }
-        )
+    for estimated in estimates[estimates["mark"] != ""].to_dict("records"):
+        agent = estimated["agent"]
+        anticipation = comparison.anticipations[estimated["scenario"], agent]
+        row = {
+            "case": estimated["scenario"],
+            "controller": label(agent),
+            "moved before the change (%)": f"{anticipation.movement.scaled(100.0):.0f}",
+            "mean error (°C)": f"{estimated['mean'].value:.3f}",
+            "least possible (°C)": f"{estimated['limit']:.3f}",
+            "with foresight (°C)": f"{estimated['preview']:.3f}",
+            "error ratio": f"{estimated['ratio'].value:.2f}",
+            "error ratio without foresight": f"{anticipation.ratio:.2f}",
+        }
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
-def difference_table(estimates: pd.DataFrame) -> pd.DataFrame:
+def difference_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts that compares the errors with those of the reference controller.
 
     A cell has the mean difference of the errors, degC, and the share of the runs in which the
-    error is smaller than that of the reference. `estimates` is the table of
-    `comparison.estimate`. If there is only one controller, the result is empty.
+    error is smaller than that of the reference. If there is only one controller, the table is
+    empty.
     """
-    if "difference" not in estimates:
+    if "difference" not in comparison.estimates:
         return pd.DataFrame()
-    compared = estimates.dropna(subset=["difference"])
-    cells = []
-    for difference, improvement in zip(
-        compared["difference"], compared["improvement"], strict=True
-    ):
-        cells.append(f"{difference:+.3f}; {100 * improvement.value:.0f} %")
-    return _by_agent(compared, cells, list(compared["agent"].unique()))
+    compared = comparison.estimates.dropna(subset=["difference"])
+    differences = compared["difference"].map("{:+.3f}".format)
+    shares = compared["improvement"].map(lambda share: f"{100 * share.value:.0f} %")
+    return _by_agent(compared, differences + "; " + shares, list(compared["agent"].unique()))
 
 
 def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
