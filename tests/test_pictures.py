@@ -53,7 +53,7 @@ class TestFindings:
 def test_a_ratio_below_the_axis_is_said_at_its_tick():
     for ratios, lowest in (([1.5, 1.002], "1.001"), ([1.5, 0.98], "≤ 1.001")):
         axes = Figure().subplots()
-        scale_by_ratio(axes, "y", ratios)
+        scale_by_ratio(axes, ratios)
         assert ticks(axes.yaxis)[:3] == [lowest, "1.003", "1.01"]
         low, high = axes.get_ylim()
         assert 0.0 < low < 0.002 < 0.5 < high

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -186,28 +186,19 @@ def excess(ratios: ArrayLike) -> NDArray[np.float64]:
     return np.maximum(ratios, RATIO_FLOOR) - 1.0
 
 
-def scale_by_ratio(axes: Axes, direction: Literal["x", "y"], ratios: ArrayLike) -> None:
-    """Make the axis on which `excess(ratios)` is drawn logarithmic, with labels for ratios.
+def scale_by_ratio(axes: Axes, ratios: ArrayLike) -> None:
+    """Make the y axis of `excess(ratios)` logarithmic, with error ratios at its ticks.
 
-    Parameters
-    ----------
-    axes
-        The panel.
-    direction
-        The axis of the panel, "x" or "y".
-    ratios
-        All error ratios in the panel, which set the ends of the axis. If one of the ratios is
-        below `RATIO_FLOOR`, the label of the lowest tick is "≤ 1.001" in place of "1.001".
+    `ratios` are all error ratios in the panel, which set the ends of the axis. If a ratio is
+    below `RATIO_FLOOR`, the label of the lowest tick is "≤ 1.001" in place of "1.001".
     """
-    from matplotlib import ticker
+    from matplotlib.ticker import NullLocator
 
-    values = excess(ratios)
+    heights = excess(ratios)
     labels = [f"{ratio:g}" for ratio in RATIO_TICKS]
     if np.min(ratios) < RATIO_FLOOR:
         labels[0] = f"≤ {labels[0]}"
-    limits = (values.min() / 1.4, values.max() * 1.4)
-    axes.set(**{f"{direction}scale": "log", f"{direction}lim": limits})
-    axis = getattr(axes, f"{direction}axis")
-    axis.set_major_locator(ticker.FixedLocator([ratio - 1.0 for ratio in RATIO_TICKS]))
-    axis.set_major_formatter(ticker.FixedFormatter(labels))
-    axis.set_minor_locator(ticker.NullLocator())
+    axes.set_yscale("log")
+    axes.set_yticks(excess(RATIO_TICKS), labels)
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_ylim(heights.min() / 1.4, heights.max() * 1.4)

@@ -97,7 +97,7 @@ def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
             look: Any = {"color": colour, "marker": marker, "ms": 5, "markevery": 0.1}
             axes.plot(shares, excess(ratios), label=label(agent), linewidth=1.3, **look)
         if styles:
-            scale_by_ratio(axes, "y", plants["ratio"])
+            scale_by_ratio(axes, plants["ratio"])
             # The controller with the largest errors is the uppermost line.
             figure.legend(loc="outside right center", reverse=True)
         axes.set_xlim(0.0, 100.0)
