@@ -193,17 +193,19 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator, NullLocator
 
-    from benchmarks.lib.pictures import open_panels
+    from benchmarks.lib.pictures import open_picture
 
-    with open_panels(path, [*PANELS.values()], 3.1, 2, finding(rows)) as panels:
-        for panel, case in zip(panels.axes, PANELS, strict=True):
+    with open_picture(path, 4.3, finding(rows)) as figure:
+        panels = figure.subplots(1, len(PANELS))
+        for panel, (case, title) in zip(panels, PANELS.items(), strict=True):
+            panel.set_title(title)
             rows_of_case = rows[rows["case"] == case]
             for name in RULES:
                 _draw_rule(panel, rows_of_case[rows_of_case["agent"] == name], name)
             panel.set_xlabel("valve travel in a run (t/h)")
             panel.set_ylabel("mean error / least possible error")
             panel.yaxis.set_major_locator(MaxNLocator(5))
-        noisy = panels.axes[0]
+        noisy = panels[0]
         noisy.set_xscale("log")
         noisy.set_xticks(TICKS, [f"{tick:,}" for tick in TICKS])
         noisy.xaxis.set_minor_locator(NullLocator())
@@ -211,7 +213,7 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
         large: Any = {"marker": "o", "markersize": 9, "markeredgecolor": "k", "linestyle": ""}
         handles.append(Line2D([], [], color="0.8", **large))
         names.append(f"Ms {ROBUSTNESS:g}")
-        panels.figure.legend(
+        figure.legend(
             handles, names, title=LEGEND, loc="outside lower center", ncols=len(names)
         )
 

@@ -7,11 +7,9 @@ dark page. The title of a picture is a sentence that says what the picture shows
 
 from __future__ import annotations
 
-import math
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -94,88 +91,6 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         canvas.draw()  # `Figure.savefig` would draw twice because of the layout.
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     picture.quantize(PALETTE, Image.Quantize.FASTOCTREE).save(path)
-
-
-@dataclass(frozen=True)
-class Panels:
-    """A figure with a grid of panels, such as one panel for each controller.
-
-    Attributes
-    ----------
-    figure : Figure
-        The figure.
-    axes : sequence of Axes
-        The panels, row by row.
-    unused : sequence of Axes
-        The invisible axes that fill the last row of the grid behind the last panel.
-    columns : int
-        Number of panels in a full row.
-    """
-
-    figure: Figure
-    axes: Sequence[Axes]
-    unused: Sequence[Axes]
-    columns: int
-
-    def label_edges(self, x: str, y: str) -> None:
-        """Write the label `y` at the left of each row, and the label `x` below each column."""
-        for panel in self.axes[:: self.columns]:
-            panel.set_ylabel(y)
-        for panel in self.axes[-self.columns :]:
-            panel.set_xlabel(x)
-
-    def add_legend(self, entries: Mapping[str, Artist], columns: int) -> None:
-        """Add a legend in the unused part of the last row of panels, or below all panels.
-
-        Parameters
-        ----------
-        entries
-            The line or patch that the legend shows beside each text, by the text.
-        columns
-            Number of columns of a legend below all panels. A legend in the last row has one
-            column.
-        """
-        handles = list(entries.values())
-        texts = list(entries)
-        if self.unused:
-            legend = self.unused[0].legend(handles, texts, loc="center left")
-            legend.set_in_layout(False)  # It may be wider than a panel.
-            return
-        self.figure.legend(handles, texts, loc="outside lower center", ncols=columns)
-
-
-@contextmanager
-def open_panels(
-    path: Path, names: Sequence[str], height: float, columns: int, title: str
-) -> Iterator[Panels]:
-    """Yield a figure with a grid of panels, to be drawn on in the block of a `with` statement.
-
-    The figure is saved as a PNG file when the block ends without an error.
-
-    Parameters
-    ----------
-    path : Path
-        The PNG file.
-    names : sequence of str
-        The heading of each panel.
-    height : float
-        Height of a panel, inches.
-    columns : int
-        Largest number of panels in a row.
-    title : str
-        A sentence above the figure.
-    """
-    columns = min(columns, len(names))
-    rows = math.ceil(len(names) / columns)
-    with open_picture(path, height * rows + 1.2, title) as figure:
-        places = list(figure.subplots(rows, columns, squeeze=False).flat)
-        axes = places[: len(names)]
-        unused = places[len(names) :]
-        for panel, name in zip(axes, names, strict=True):
-            panel.set_title(name)
-        for panel in unused:
-            panel.set_axis_off()
-        yield Panels(figure, axes, unused, columns)
 
 
 def excess(ratios: ArrayLike) -> NDArray[np.float64]:
