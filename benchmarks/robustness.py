@@ -33,13 +33,21 @@ PANELS = {
 SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3
 TICKS = 200, 500, 1000, 2000, 5000  # ticks of the axis of valve travel in noise, t/h
 TEXT = (
-    "Each tuning rule has one free time constant. In the table, the time constant is chosen "
-    f"such that the loop has a maximum sensitivity Ms of {ROBUSTNESS:g} on the paper's plant, "
-    "without its dead zone and limits. The columns of the cases are mean errors divided by the "
-    "least possible error. The range of stable delays, in samples, is the range around the "
-    "plant's delay of 18 samples in which the loop is stable."
+    "The maximum sensitivity Ms is the largest magnitude of the sensitivity function of a "
+    "control loop: the lower Ms is, the more robust is the loop. Each of the three controllers "
+    "is tuned by a rule with one free time constant. In the table, this time constant is "
+    f"chosen such that the loop with the paper's plant has an Ms of {ROBUSTNESS:g}, where dead "
+    "zone and limits of the actuator are left out. The columns square, square-noise, constant "
+    "and load have the error ratio in these cases of the comparison, which is the mean error "
+    "divided by the least possible error. The valve travel is the sum of all changes of the "
+    "applied flow in a run of the case square-noise. The last column has the range of delays "
+    "with which the loop is stable; the paper's plant has a delay of 18 samples."
 )
-CAPTION = "Error over valve travel along the robustness of three rules"
+LEGEND = (
+    "marks of a line, from left to right: maximum sensitivity Ms of "
+    f"{', '.join(f'{ms:g}' for ms in SENSITIVITIES)} (a low Ms is robust)"
+)
+CAPTION = "Error ratio over valve travel of three linear controllers at several values of Ms"
 
 
 @options
@@ -70,13 +78,13 @@ def work(options: Options) -> str:
     table = pd.DataFrame([row for name in loops for row in results[name]])
     table["ratio"] = table["mean_error"] / table["case"].map(results)
     compared = table[table["Ms"] == ROBUSTNESS]
-    title = f"Three rules at an Ms of {ROBUSTNESS:g}"
+    title = f"Three linear controllers with a maximum sensitivity Ms of {ROBUSTNESS:g}"
     pictures = {"robustness.png": CAPTION}
     sections = [Section(title, [TEXT], overview(compared), pictures=pictures)]
     with results_folder(options.out) as folder:
         write_csv(folder / "robustness.csv", table)
         draw(table, folder / "robustness.png")
-        write_report(folder, "Rules at one robustness", sections, provenance)
+        write_report(folder, "Linear controllers of equal robustness", sections, provenance)
     return f"The report, all numbers and the picture are in {options.out}/"
 
 
@@ -145,13 +153,14 @@ def overview(rows: pd.DataFrame) -> pd.DataFrame:
         by_case = rows[rows["agent"] == name].set_index("case")
         noisy: Any = by_case.loc["square-noise"]
         argument = ROSTER[name].tuned_by
+        delays = f"{noisy['shortest_delay']:g} to {noisy['longest_delay']:g}"
         ratios = {case: f"{by_case['ratio'][case]:.3f}" for case in CASES}
         line = {
             "controller": label(name),
             "time constant": f"{argument.replace('_', ' ')} {noisy[argument]:.3g} s",
             **ratios,
             "valve travel in noise (t/h)": f"{noisy['travel']:,.0f}",
-            "stable delays": f"{noisy['shortest_delay']:g} to {noisy['longest_delay']:g}",
+            "stable with delays of (samples)": delays,
         }
         lines.append(line)
     return pd.DataFrame(lines)
@@ -169,9 +178,9 @@ def finding(rows: pd.DataFrame) -> str:
     least, most = ordered.iloc[0], ordered.iloc[-1]
     share = 100.0 * least["travel"] / most["travel"]
     return (
-        f"At an Ms of {ROBUSTNESS:g}, {label(least['agent'])}'s valve travels {share:.0f} % as "
-        f"far in noise as {label(most['agent'])}'s, with {least['ratio']:.3f} against "
-        f"{most['ratio']:.3f} times the least possible error"
+        f"At equal robustness (Ms {ROBUSTNESS:g}) and in noise, {label(least['agent'])} moves "
+        f"the valve {share:.0f} % as far as {label(most['agent'])}, with an error ratio of "
+        f"{least['ratio']:.3f} against {most['ratio']:.3f}"
     )
 
 
@@ -184,31 +193,35 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator, NullLocator
 
-    from benchmarks.lib.pictures import open_panels
+    from benchmarks.lib.pictures import open_picture
 
-    with open_panels(path, [*PANELS.values()], 3.1, 2, finding(rows)) as panels:
-        for panel, case in zip(panels.axes, PANELS, strict=True):
+    with open_picture(path, 4.3, finding(rows)) as figure:
+        panels = figure.subplots(1, len(PANELS))
+        for panel, (case, title) in zip(panels, PANELS.items(), strict=True):
+            panel.set_title(title)
             rows_of_case = rows[rows["case"] == case]
             for name in RULES:
                 _draw_rule(panel, rows_of_case[rows_of_case["agent"] == name], name)
             panel.set_xlabel("valve travel in a run (t/h)")
+            panel.set_ylabel("mean error / least possible error")
             panel.yaxis.set_major_locator(MaxNLocator(5))
-        noisy = panels.axes[0]
+        noisy = panels[0]
         noisy.set_xscale("log")
         noisy.set_xticks(TICKS, [f"{tick:,}" for tick in TICKS])
         noisy.xaxis.set_minor_locator(NullLocator())
-        noisy.set_ylabel("mean error / least possible")
         handles, names = noisy.get_legend_handles_labels()
         large: Any = {"marker": "o", "markersize": 9, "markeredgecolor": "k", "linestyle": ""}
         handles.append(Line2D([], [], color="0.8", **large))
-        names.append(f"Ms {ROBUSTNESS:g}; numbers: Ms of the ends")
-        panels.figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+        names.append(f"Ms {ROBUSTNESS:g}")
+        figure.legend(
+            handles, names, title=LEGEND, loc="outside lower center", ncols=len(names)
+        )
 
 
 def _draw_rule(panel: Any, rows: pd.DataFrame, name: str) -> None:
     """Draw a controller's line of error ratio over valve travel in a panel.
 
-    The line is labelled with the Ms at both ends, and has a large mark at the Ms `ROBUSTNESS`.
+    The line has a mark for each Ms, and a large mark at the Ms `ROBUSTNESS`.
 
     Parameters
     ----------
@@ -224,10 +237,6 @@ def _draw_rule(panel: Any, rows: pd.DataFrame, name: str) -> None:
     panel.plot(rows["travel"], rows["ratio"], **style, markersize=4, label=label(name))
     compared = rows[rows["Ms"] == ROBUSTNESS]
     panel.plot(compared["travel"], compared["ratio"], **style, ms=10, mec="k")
-    offset: Any = {"xytext": (5, 4), "textcoords": "offset points"}
-    for end in (rows.iloc[0], rows.iloc[-1]):
-        place = end["travel"], end["ratio"]
-        panel.annotate(f"{end['Ms']:g}", place, color=colour, fontsize=8, **offset)
 
 
 main = command("robustness", Options, work)

@@ -1,5 +1,6 @@
 """Make a film of a controller at work: `python -m benchmarks.watch --help`."""
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 SAMPLES_PER_FRAME = 20  # samples of the run between two frames of the film
 DURATION = 100  # ms for which a frame is shown
 LAST_DURATION = 2000  # ms for which the last frame is shown, before the film repeats
-COLOURS = 24  # number of colours in the film; few colours make the file small
+COLOURS = 64  # number of colours in the film; few colours make the file small
 
 
 @options
@@ -96,9 +97,10 @@ def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed:
 
 
 def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterator[Image]":
-    """Yield the frames of a film: the pictures of a run as the environment renders them.
+    """Yield the frames of a film: pictures in the style in which the environment renders.
 
-    There is a picture after every `SAMPLES_PER_FRAME` samples.
+    There is a picture for every `SAMPLES_PER_FRAME` samples. In contrast to the environment's
+    pictures, all pictures span the whole run, so that the start of the run stays visible.
 
     Parameters
     ----------
@@ -118,15 +120,20 @@ def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterat
     numbers = {name: float(values[0]) for name, values in vars(drawn).items()}
     initial_setpoint = float(trajectory.setpoint[0, 0])
     record = Record(PlantNumbers(**numbers), parameters.sampling_interval, initial_setpoint)
+    samples = len(trajectory.setpoint)
+    record.span = samples
+    record.samples = deque(record.samples)  # without a limit of the length
     next_outputs = trajectory.next_setpoint - trajectory.next_error
-    for k in range(len(trajectory.setpoint)):
+    for k in range(samples):
         record.add(
             setpoint=float(trajectory.next_setpoint[k, 0]),
             output=float(next_outputs[k, 0]),
             command=float(trajectory.command[k, 0]),
             applied=float(trajectory.applied[k, 0]),
         )
-        if record.k % SAMPLES_PER_FRAME == 0:
+        # The set point often changes at the last sample, at which the last picture would show a
+        # large error. So each picture is one sample early.
+        if (record.k + 1) % SAMPLES_PER_FRAME == 0:
             yield Image.fromarray(frame(record))
 
 

@@ -14,7 +14,7 @@ from benchmarks.compare.anticipation import (
     surprising_setpoint,
 )
 from benchmarks.compare.comparison import estimate, ranked, run_case, scale_of
-from benchmarks.compare.report import ratio_table
+from benchmarks.compare.report import anticipation_table, ratio_table
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.controllers.spec import LIMITS, ControllerSpec
 from benchmarks.loop.linear import nominal
@@ -23,6 +23,7 @@ from benchmarks.loop.scenarios import SCENARIOS, Scenario
 from mptc_gym import Parameters
 from mptc_gym.evaluation import SEED
 from mptc_gym.plant.dynamics import action_from_command
+from tests.test_compare import a_comparison
 
 EARLY = 270  # age of a level, samples, from which `Early` expects the next one
 
@@ -116,11 +117,18 @@ def test_a_comparison_ranks_by_the_surprise_and_shows_the_mark():
     runs = pd.concat([case.runs for case in cases], ignore_index=True)
     scales = {"square": scale_of(scenario, 2, SEED)}
     estimates = estimate(runs, scales, anticipations)
-    assert [*ranked(estimates)] == ["smith", "early"]
-    assert [*ranked(estimate(runs, scales))] == ["early", "smith"]
-    rows = ratio_table(estimates, scales, ["smith", "early"]).set_index("controller")
+    scores = ranked(estimates, {})
+    assert [*scores] == ["smith", "early"]
+    assert [*ranked(estimate(runs, scales, {}), {})] == ["early", "smith"]
+    compared = a_comparison(
+        scales=scales, estimates=estimates, anticipations=anticipations, scores=scores
+    )
+    rows = ratio_table(compared).set_index("controller")
     assert rows.loc["early", "square"].endswith("‡")
     assert not rows.loc["Smith", "square"].endswith("‡")
+    (row,) = anticipation_table(compared).to_dict("records")
+    assert (row["case"], row["controller"]) == ("square", "early")
+    assert row["error ratio without foresight"] > row["error ratio"]
 
 
 def test_a_loop_that_runs_away_does_not_anticipate():

@@ -6,11 +6,11 @@ from unittest.mock import Mock
 import numpy as np
 import pandas as pd
 
-from benchmarks.claims import claims
+from benchmarks.claims import examinations
 from benchmarks.claims.__main__ import main
-from benchmarks.claims.claims import CLAIMS, Claim, converged_at, examined
+from benchmarks.claims.claims import CLAIMS, Claim, examined
 from benchmarks.claims.findings import judge, sections, table, verdict
-from benchmarks.claims.runs import Batch
+from benchmarks.claims.runs import Batch, converged_at
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.rollout import settled
 from tests.conftest import ROOT, trajectory
@@ -111,7 +111,7 @@ class TestCommand:
             def run(self, agent, samples, before=None, **arguments):
                 return super().run(agent, min(samples, 60), before, **arguments)
 
-        monkeypatch.setattr(claims, "LEARNING", 30)
+        monkeypatch.setattr(examinations, "LEARNING", 30)
         rows = [
             {"claim": name, **{column: row[column] for column in ("value", "low", "high")}}
             for name in CLAIMS

@@ -106,12 +106,23 @@ def some_runs(**errors):
     )
 
 
+def a_comparison(**results):
+    """Return a comparison with some results, and empty ones in place of the others."""
+    empty = pd.DataFrame()
+    return report.Comparison(
+        **{
+            "controllers": ROSTER, "results": [], "scales": {}, "runs": empty,
+            "estimates": empty, "anticipations": {}, "misfits": {}, "scores": {}, **results,
+        }
+    )  # fmt: skip
+
+
 class TestEstimates:
     def test_by_hand(self):
         scale = scale_of(SCENARIOS["constant"], 3, SEED)
         limit = scale.least.value
         runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
-        found = estimate(runs.assign(scenario="constant"), {"constant": scale})
+        found = estimate(runs.assign(scenario="constant"), {"constant": scale}, {})
         nn, ppo_ = found.to_dict("records")
         assert (nn["mean"].value, nn["limit"]) == (2.0, limit)
         assert nn["ratio"].value == pytest.approx(2.0 / limit)
@@ -130,10 +141,12 @@ class TestEstimates:
             runs = some_runs(a=[[idle, half]], b=[[least, half]])
             rows.append(runs.assign(scenario=name, total_variation=12.0))
         runs = pd.concat(rows)
-        found = estimate(runs, scales)
-        scores = ranked(found)
+        found = estimate(runs, scales, {})
+        scores = ranked(found, {})
         assert scores["b"].value == pytest.approx(0.75)
-        best, other = report.score_table(runs, found, scores).to_dict("records")
+        best, other = report.score_table(
+            a_comparison(runs=runs, estimates=found, scores=scores)
+        ).to_dict("records")
         assert (best["controller"], best["travel (t/h)"], best["square"]) == (
             "b", "12", "0.75",
         )  # fmt: skip
@@ -218,7 +231,9 @@ class TestReport:
 def test_a_controller_has_one_look_wherever_it_is_listed():
     everyone = looks([*ROSTER, "mine", "yours"])
     assert len(set(everyone.values())) == len(everyone)
-    assert looks(["mine", "pi"]) == {"mine": everyone["mine"], "pi": everyone["pi"]}
+    assert looks(["yours", "pi", "mine"]) == {
+        name: everyone[name] for name in ("yours", "pi", "mine")
+    }
 
 
 @pytest.fixture
@@ -261,7 +276,7 @@ class TestCompare:
             assert f"{error / limit:.2f}" in shown
         # The best comes first.
         assert page.index("| MPC") < page.index("| NN (1992)") < page.index("| PI (1992)")
-        assert "6 gains by the search of version 0.1" in page
+        assert "6 settings by the search of version 0.1" in page
         provenance = json.loads((out / "provenance.json").read_text())
         assert "missing" not in provenance
         assert provenance["seeds"] == [SEED, SEED + 1, SEED + 2]
@@ -405,6 +420,19 @@ class TestCompare:
         assert set(comparison.misfits_of(ROSTER, [slow])) == {
             "nn", "nn-frozen", "pi", "pi-searched", "ppo", "ppo-hard",
         }  # fmt: skip
+
+    def test_few_controllers_are_all_pictured_and_of_many_the_chosen_ones(self):
+        def pictured(names, misfits=()):
+            scores, reasons = dict.fromkeys(names), dict.fromkeys(misfits)
+            return a_comparison(scores=scores, misfits=reasons).pictured
+
+        few = ["mpc", "nn", "self-tuning"]
+        assert pictured(few) == few
+        assert pictured(few, ["nn"]) == ["mpc", "self-tuning"]
+        assert pictured(few, few) == few
+        chosen = {"nn", "pi", "dahlin", "ppo", "neural-smith"}
+        assert set(pictured(list(ROSTER))) == chosen
+        assert set(pictured(list(ROSTER), ["pi"])) == chosen - {"pi"}
 
     def test_the_costs_have_the_robustness_of_the_linear_controllers(self):
         specs = {name: ROSTER[name] for name in ("pi", "pi-simc", "smith", "dahlin", "mpc")}

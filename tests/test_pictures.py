@@ -26,15 +26,15 @@ class TestFindings:
         scores = {"mpc": 0.998, "neural-smith": 0.9971, "mine": 0.9, "pi": -0.0001}
         estimates = {agent: Estimate(x, x, x, 1) for agent, x in scores.items()}
         assert plots.scores_finding(estimates) == (
-            "MPC scores highest with 0.998, neural Smith follows with 0.997; "
-            "PI (1992) scores lowest with 0.000"
+            "MPC has the highest score (0.998), neural Smith the second highest (0.997), "
+            "and PI (1992) the lowest (0.000)"
         )
-        assert plots.scores_finding({"mine": estimates["mine"]}) == "mine scores 0.900"
+        assert plots.scores_finding({"mine": estimates["mine"]}) == "mine has a score of 0.900"
 
     def test_of_responses(self):
         errors = pd.Series({"mpc": 0.5, "nn": 1.0, "pi": 1.27})
         finding = plots.responses_finding(errors)
-        assert finding == "the mean error of PI (1992) is 2.5 times that of MPC"
+        assert finding == "PI (1992) has 2.5 times the mean error of MPC"
 
     def test_of_plants(self):
         ratios = {"pi": [1.0, 2.0, 3.0, np.nan], "smith": [1.01, 1.04, 1.2, 1.05]}
@@ -51,9 +51,9 @@ class TestFindings:
 
 
 def test_a_ratio_below_the_axis_is_said_at_its_tick():
-    for ratios, lowest in (([1.5, 1.002], "1.001"), ([1.5, 0.98], "< 1.001")):
+    for ratios, lowest in (([1.5, 1.002], "1.001"), ([1.5, 0.98], "≤ 1.001")):
         axes = Figure().subplots()
-        scale_by_ratio(axes, "y", ratios)
+        scale_by_ratio(axes, ratios)
         assert ticks(axes.yaxis)[:3] == [lowest, "1.003", "1.01"]
         low, high = axes.get_ylim()
         assert 0.0 < low < 0.002 < 0.5 < high
@@ -87,7 +87,7 @@ def test_scores_beyond_the_axis_stand_at_its_ends(figures, tmp_path):
     plots.plot_scores(scores, pd.DataFrame(rows), tmp_path / "scores.png")
     (axes,) = figures[0].axes
     labels = ticks(axes.xaxis)
-    assert (labels[0], labels[-1]) == ("< -0.5", "> 0.999")
+    assert (labels[0], labels[-1]) == ("≤ -0.5", "≥ 0.999")
     shown = np.concatenate([line.get_xdata() for line in axes.get_lines()])
     right, left = sorted(axes.get_xlim())
     assert ((right < shown) & (shown < left)).all()
@@ -119,22 +119,22 @@ class TestResponses:
         low, high = pi.get_ylim()
         assert low < 3.0 < 7.0 < high
         assert flow.get_xlim() == (0.0, pytest.approx(599 * 8 / 60))
-        assert "2.0 times that of Smith" in figures[0].get_suptitle()
+        assert "2.0 times the mean error of Smith" in figures[0].get_suptitle()
 
     @pytest.mark.parametrize(
         ("spread", "plant", "texts"),
         [
-            (0.0, {}, ["set point", "dead zone", "limits"]),
+            (0.0, {}, ["set point", "dead zone", "flow limits"]),
             (
                 1.0, {"dead_zone": [3, 7]},
                 [
-                    "set point", "first run; 10th to 90th percentile of all",
-                    "smallest dead zone", "limits",
+                    "set point", "line: first run; band: 10th to 90th percentile",
+                    "smallest dead zone", "flow limits",
                 ],
             ),
             (
                 0.0, {"setpoint": "random", "u_max": [8, 10]},
-                ["set point", "first run", "dead zone", "widest limits"],
+                ["set point", "first run", "dead zone", "widest flow limits"],
             ),
         ],
     )  # fmt: skip

@@ -14,11 +14,15 @@ from benchmarks.lib.statistics import Estimate, quantile, share
 Finding = dict[str, Any]  # a row of the table of numbers, as `judge` returns it
 
 NOTE = (
-    "Each case is run with independent initial weights and noise. A mean error is the mean of "
-    "|e| over the samples of one run. A mean error in the table is the median over the runs, "
-    "and so is a ratio of mean errors. A criterion counts as met only if the entire 95 % "
-    "confidence interval satisfies it. A claim holds if all its criteria are met, and it holds "
-    "in part if some of its criteria are met."
+    "The claims are those of the paper by Cui and Shin (1992). The NN is the paper's "
+    "controller, a neural network that learns online. Each case is run many times, with "
+    "different initial weights and noise. A mean error is the mean of |e| over the samples "
+    "of a run, where e is the set point minus the temperature y. A value in the tables is "
+    "the median over the runs, unless its unit is '% of runs', with a 95 % confidence "
+    "interval. The column 'asked' has the criterion that a claim must meet. A criterion is "
+    "met, and 'shown' is 'yes', only if the entire confidence interval satisfies the "
+    "criterion. A claim holds if all its criteria are met, and it holds in part if some of "
+    "its criteria are met. A value without a criterion is for information only."
 )
 # Least share of runs for claims such as "the controller works" or "the weights converge".
 OFTEN = 0.9

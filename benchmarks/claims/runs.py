@@ -1,8 +1,8 @@
 """Run batches of the paper's neural controller and of PI controllers, and log weights."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,9 @@ Array = NDArray[np.floating]
 PAPER_NODES = 3  # number of hidden nodes of the paper's network
 PAPER_LENGTH = 3  # number of set points, and of errors, among the inputs of the paper's network
 # Weights have converged if their distance from their final values is at most this share of the
-# distance at the start of the run, for at least the last `STAY` samples of the run.
-CONVERGED = 0.05
-STAY = 100
-
-
-class Gains(NamedTuple):
-    """The gains of a PI controller, whose command is -kp e(k) - ki times the sum of errors."""
-
-    kp: float  # t/h per degC
-    ki: float  # t/h per degC and sample
+# distance at the start of the run, for at least this many samples at the end of the run.
+CONVERGED_SHARE = 0.05
+CONVERGED_SAMPLES = 100
 
 
 @dataclass(frozen=True)
@@ -42,7 +35,7 @@ class Batch:
         in_proportion: bool = False,
         direction: int = -1,
     ) -> DirectNNController:
-        """Return a learning network for each run of the batch, by default the paper's network.
+        """Return learning networks, one for each run of the batch; by default, the paper's.
 
         Parameters
         ----------
@@ -51,9 +44,9 @@ class Batch:
         length
             Number of set points, and of errors, among the inputs of a network.
         in_proportion
-            Whether the learning rates are scaled by the paper's number of nodes, or inputs,
-            divided by the present number. With equal learning rates, a larger network learns
-            faster, as more terms of a sum change at the same time.
+            Whether the learning rates are multiplied by the paper's number of nodes, or inputs,
+            divided by the number in this network. With equal learning rates, a larger network
+            learns faster, as more terms of a sum change at the same time.
         direction
             The sign of the plant's gain that a network assumes: -1, or 1 for the wrong sign.
         """
@@ -89,7 +82,7 @@ class Batch:
         agent
             The controller, for all runs of the batch.
         samples
-            Length of a run.
+            Length of a run, in samples.
         before
             Function that is called with k before the controller acts at sample k.
         **arguments
@@ -101,18 +94,18 @@ class Batch:
     def run_nn(self, samples: int, **arguments: Any) -> Trajectory:
         """Run the paper's network, and return the trajectory of all runs of the batch.
 
-        `samples` is the length of a run, and `arguments` those of the environment.
+        `samples` is the length of a run, and `arguments` are arguments of the environment.
         """
         return self.run(self.networks(), samples, **arguments)
 
-    def run_pi(self, gains: Gains, samples: int, **arguments: Any) -> Trajectory:
-        """Run a PI controller, and return its trajectory.
+    def run_pi(self, gains: Mapping[str, float], samples: int, **arguments: Any) -> Trajectory:
+        """Run a PI controller with the gains `kp` and `ki`, and return the trajectory.
 
         Without the argument `noise_variance`, all runs would be equal, so there is one run.
-        `samples` is the length of a run, and `arguments` those of the environment.
+        `samples` is the length of a run, and `arguments` are arguments of the environment.
         """
         batch = self if "noise_variance" in arguments else Batch(1, self.seed)
-        return batch.run(PIController(*gains), samples, **arguments)
+        return batch.run(PIController(gains["kp"], gains["ki"]), samples, **arguments)
 
 
 @dataclass
@@ -120,22 +113,22 @@ class WeightLog:
     """A log of the weights of learning networks, to be called before each sample of a run."""
 
     networks: DirectNNController  # a batch of networks, one for each run
-    rows: list[Array] = field(default_factory=list)  # weights of a sample, (runs, weights)
+    weights: list[Array] = field(default_factory=list)  # by sample, each (runs, weights)
 
     def __call__(self, k: int) -> None:
-        """Append the present weights, those before the controller acts at sample k."""
+        """Append the weights of all networks before they act at sample k."""
         arrays = vars(self.networks.weights).values()
         columns = [array.reshape(len(array), -1) for array in arrays]
-        self.rows.append(np.hstack(columns, dtype=np.float32))
+        self.weights.append(np.hstack(columns, dtype=np.float32))
 
 
 def converged_at(weights: Array) -> Array:
     """Return the sample from which on the weights of each run have converged, shape (runs,).
 
     From this sample on, the Euclidean distance of the weights from their final values is at
-    most `CONVERGED` times the distance at the start. Weights that come this close to their
-    final values only in the last `STAY` samples have not converged, as the run may end while
-    the weights are still moving; for such a run the result is infinite.
+    most `CONVERGED_SHARE` times the distance at the start. If the weights come this close to
+    their final values only in the last `CONVERGED_SAMPLES` samples, they may still be moving
+    when the run ends, and the result is infinite.
 
     Parameters
     ----------
@@ -144,8 +137,8 @@ def converged_at(weights: Array) -> Array:
     """
     samples = len(weights)
     distances = np.linalg.norm(weights - weights[-1], axis=2)
-    is_outside = distances > CONVERGED * distances[0]
+    is_outside = distances > CONVERGED_SHARE * distances[0]
     # One sample after the last sample outside; 0 if no sample is outside.
     samples_inside = np.argmax(is_outside[::-1], axis=0)
     first_inside = np.where(is_outside.any(axis=0), samples - samples_inside, 0)
-    return np.where(first_inside <= samples - STAY, first_inside, np.inf)
+    return np.where(first_inside <= samples - CONVERGED_SAMPLES, first_inside, np.inf)

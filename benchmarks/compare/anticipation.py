@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.bounds.least import least_possible
 from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.loop.rollout import Trajectory, held, mean_error
@@ -25,9 +26,9 @@ Array = NDArray[np.float64]
 
 # A controller counts as one that anticipates if the temperature makes at least this share of a
 # set-point change before it can respond to the change.
-MARKED = 0.05
-# Number of timetables, which say when the set point changes in surprising runs. A tenth of the
-# runs has the same timetable.
+LEAST_MOVEMENT = 0.05
+# Number of timetables, which say when the set point changes in surprising runs. As the least
+# possible error takes long to compute, a tenth of the runs has the same timetable.
 TIMETABLES = 10
 TIMETABLE_SEED = 0  # of the random times in the first timetable, not of an episode
 
@@ -45,7 +46,8 @@ class Anticipation:
         On the square wave: the share of a set-point change that the output has made before the
         output can respond to the change.
     errors : Array
-        Errors of the controller in surprising runs, degC, shape (members, runs).
+        Errors of the controller in surprising runs, degC, shape (members, runs). The members
+        are the trained networks of the controller.
     least : float
         Least possible error in surprising runs without foresight, degC, a mean over the runs.
     idle : float
@@ -64,10 +66,9 @@ class Anticipation:
 
     @property
     def scores(self) -> Array:
-        """Score of each surprising run, shape (members, runs): 0 if idle, 1 if `least`.
+        """Score of each surprising run, shape (members, runs).
 
-        A run with the error `idle` has the score 0, and a run with the error `least` has the
-        score 1. Members are the trained networks of a controller.
+        The score is 0 for the error of an idle valve, and 1 for the least possible error.
         """
         return (self.idle - self.errors) / (self.idle - self.least)
 
@@ -79,16 +80,16 @@ def anticipation(
     runs: int,
     seed: int,
 ) -> Anticipation | None:
-    """Return how much a controller anticipates the changes of a square wave, if it does.
+    """Return how much a controller anticipates the changes of a square wave.
 
-    The result is None if the controller does not act before the changes. If the controller acts
-    before the changes, it runs again, in surprising runs, in which nobody can foresee when the
-    set point changes.
+    If the controller does not act before the changes, or the set point is no square wave, the
+    result is None. Otherwise, the controller runs again, with set points whose changes nobody
+    can foresee.
 
     Parameters
     ----------
     scenario
-        The scenario. If the set point of the scenario is no square wave, the result is None.
+        The scenario.
     members
         The records of the controller's members, one for each trained network.
     trajectories
@@ -102,22 +103,20 @@ def anticipation(
     if scenario.parameters.setpoint != "square":
         return None
     movement = movement_before_changes(scenario, trajectories)
-    if movement is None or movement.low <= 0.0 or movement.value < MARKED:
+    if movement is None or movement.low <= 0.0 or movement.value < LEAST_MOVEMENT:
         return None
-    if not _follows(trajectories):
+    # The output of an unstable loop moves at all times, and anticipates nothing.
+    if not follows_setpoint(trajectories):
         return None
     seeds = np.arange(seed, seed + runs)
     are_equal = trajectories[0].output.shape[1] == 1
-    return _run_surprised(scenario, members, movement, seeds, are_equal)
+    return run_surprised(scenario, members, movement, seeds, are_equal)
 
 
-def _follows(trajectories: Sequence[Trajectory]) -> bool:
-    """Return whether the mean error is smaller than that of an output that stays at 0.
-
-    A loop that is unstable moves at all times, and anticipates nothing.
-    """
-    errors = np.concatenate([np.abs(run.next_error).ravel() for run in trajectories])
-    setpoints = np.concatenate([np.abs(run.setpoint).ravel() for run in trajectories])
+def follows_setpoint(trajectories: Sequence[Trajectory]) -> bool:
+    """Return whether the mean error is smaller than that of an output that stays at 0 degC."""
+    errors = np.concatenate([np.abs(batch.next_error).ravel() for batch in trajectories])
+    setpoints = np.concatenate([np.abs(batch.setpoint).ravel() for batch in trajectories])
     return bool(errors.mean() < setpoints.mean())
 
 
@@ -148,7 +147,7 @@ def movement_before_changes(
     """
     window = int(scenario.parameters.range_of("delay")[0]) + 1
     setpoint = trajectories[0].setpoint[:, 0]
-    outputs = np.hstack([trajectory.output for trajectory in trajectories])
+    outputs = np.hstack([batch.output for batch in trajectories])
     movements = []
     for (start, change), (_, stop) in itertools.pairwise(held(setpoint)):
         quarter = (change - start) // 4
@@ -156,17 +155,18 @@ def movement_before_changes(
             continue
         step = setpoint[change] - setpoint[start]
         shares = (outputs - setpoint[start]) / step  # 0 at the old set point, 1 at the new one
-        earlier = np.lib.stride_tricks.sliding_window_view(
-            shares[start + quarter : change - quarter], window, axis=0
-        ).mean(axis=-1)
-        nearest = earlier[np.argmax(earlier.mean(axis=1))]
-        movements.append(shares[change : change + window].mean(axis=0) - nearest)
+        shares_before = shares[start + quarter : change - quarter]
+        windows_before = np.lib.stride_tricks.sliding_window_view(shares_before, window, axis=0)
+        means_before = windows_before.mean(axis=-1)  # shape (windows, runs)
+        nearest = means_before[np.argmax(means_before.mean(axis=1))]
+        shares_after = shares[change : change + window]
+        movements.append(shares_after.mean(axis=0) - nearest)
     if not movements:
         return None
     return student(np.mean(movements, axis=0))
 
 
-def _run_surprised(
+def run_surprised(
     scenario: Scenario,
     members: Sequence[ControllerSpec],
     movement: Estimate,
@@ -174,8 +174,6 @@ def _run_surprised(
     are_equal: bool,
 ) -> Anticipation:
     """Run a controller with set points that nobody can foresee, and return the errors.
-
-    This function is called for controllers that act before a square wave changes.
 
     Parameters
     ----------
@@ -191,39 +189,36 @@ def _run_surprised(
         Whether nothing is random, so that all runs with one timetable are equal. Each member
         then runs once with each timetable.
     """
-    from benchmarks.bounds.least import (
-        least_possible,
-    )  # imported here, as SciPy is slow to import
-
     errors = []
     least_errors: list[float] = []
     idle_errors: list[float] = []
-    for number, seeds_of_timetable in enumerate(np.array_split(seeds, TIMETABLES)):
-        runs = len(seeds_of_timetable)
-        if runs == 0:  # There are fewer runs than timetables.
-            continue
-        first_seed = int(seeds_of_timetable[0])
-        count = 1 if are_equal else runs
-        timetable = surprising_setpoint(scenario, TIMETABLE_SEED + number)
-        arguments = {**scenario.arguments, "setpoint": timetable}
-        errors_of_members = []
+    groups = np.array_split(seeds, min(TIMETABLES, len(seeds)))
+    for number, seeds_of_group in enumerate(groups):
+        runs = len(seeds_of_group)
+        simulated_runs = 1 if are_equal else runs
+        first_seed = int(seeds_of_group[0])
+        setpoint = surprising_setpoint(scenario, TIMETABLE_SEED + number)
+        arguments = {**scenario.arguments, "setpoint": setpoint}
+        errors_of_group = []
         for member in members:
             # The controller is made for the scenario with the square wave, so that it cannot
             # know the timetable.
-            controller = member.make(scenario.arguments, count, first_seed)
-            trajectory = member.run(arguments, scenario.samples, count, first_seed, controller)
-            errors_of_members.append(np.broadcast_to(mean_error(trajectory), runs))
-        bound = least_possible(
-            samples=scenario.samples, episodes=count, seed=first_seed, **arguments
+            controller = member.make(scenario.arguments, simulated_runs, first_seed)
+            trajectory = member.run(
+                arguments, scenario.samples, simulated_runs, first_seed, controller
+            )
+            errors_of_group.append(np.broadcast_to(mean_error(trajectory), runs))
+        least = least_possible(
+            samples=scenario.samples, episodes=simulated_runs, seed=first_seed, **arguments
         )
-        errors.append(errors_of_members)
-        least_errors += [bound.value] * runs
-        idle_errors += [bound.idle.value] * runs
+        errors.append(errors_of_group)
+        least_errors += [least.value] * runs
+        idle_errors += [least.idle.value] * runs
     return Anticipation(
-        movement,
-        np.concatenate(errors, axis=1),
-        float(np.mean(least_errors)),
-        float(np.mean(idle_errors)),
+        movement=movement,
+        errors=np.concatenate(errors, axis=1),
+        least=float(np.mean(least_errors)),
+        idle=float(np.mean(idle_errors)),
     )
 
 
@@ -231,10 +226,9 @@ def surprising_setpoint(scenario: Scenario, seed: int) -> list[float]:
     """Return a set point whose changes nobody can foresee, degC, one number for each sample.
 
     The set point has the two values of the scenario's square wave, in turn, and stays at each
-    value for half a period of the square wave on average. After a quarter of the period, the
-    set point changes at each sample with the same probability. So the time since the latest
-    change does not show when the next change comes. `seed` is the seed of the times of the
-    changes.
+    value for half a period of the square wave on average. From a quarter of the period after a
+    change on, the set point changes at each sample with the same probability. So the time since
+    a change does not show when the next change comes. `seed` is the seed of the random times.
     """
     generator = np.random.default_rng(seed)
     parameters = scenario.parameters

@@ -9,12 +9,13 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
+from benchmarks.bounds.least import LeastPossible, least_possible
 from benchmarks.compare.anticipation import Anticipation, anticipation
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.controllers.spec import ControllerSpec
@@ -27,8 +28,8 @@ from mptc_gym.evaluation import EPISODES
 
 BOOTSTRAP_SEED = 0  # of the resampling for confidence intervals, not of an episode
 
-# By the names of scenario and controller: only controllers that act before a square wave
-# changes.
+# The anticipation of each controller that acts before a square wave changes, by the name of the
+# scenario and the name of the controller.
 Anticipations = Mapping[tuple[str, str], Anticipation]
 
 
@@ -36,7 +37,8 @@ Anticipations = Mapping[tuple[str, str], Anticipation]
 class Result:
     """The results of one controller in one scenario.
 
-    A controller with several trained networks has one member for each network.
+    A controller with several trained networks has one member for each network, and each member
+    has its own runs.
 
     Attributes
     ----------
@@ -48,14 +50,13 @@ class Result:
         A row for each run of each member. The columns are `scenario`, `agent`, `policy` (the
         number of the member), `seed`, and the measures of `benchmarks.loop.rollout.measure`.
     responses : pandas.DataFrame
-        A row for each sample, with the temperature and the flow of the first run and their
-        percentiles over the runs; see `_responses`.
+        A row for each sample of time, as `responses_over_time` returns it.
     policies : sequence of mapping
         The origins of the trained networks, one for each member that was trained.
     seconds : float
         Processor time of the runs, s.
     anticipation : Anticipation, optional
-        The errors in surprising runs, if the controller acts before a square wave changes.
+        How much the controller anticipates, if it acts before a square wave changes.
     """
 
     scenario: str
@@ -71,7 +72,7 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     """Run all members of a controller in a scenario, and return the results.
 
     If neither the scenario nor the controller uses random numbers, all runs of a member are
-    equal. In this case, each member runs once, and the results have a copy of the run for each
+    equal. In this case, each member runs once, and the results have a copy of this run for each
     seed.
 
     Parameters
@@ -85,34 +86,37 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     seed
         Seed of the first run; run i has the seed `seed + i`.
     """
-    began = time.process_time()
+    start = time.process_time()
     members = controller.members()
     are_equal = not (controller.random or is_random(scenario.parameters))
-    count = 1 if are_equal else runs
-    trajectories = [
-        member.run(scenario.arguments, scenario.samples, count, seed) for member in members
-    ]
+    simulated_runs = 1 if are_equal else runs
+    trajectories = []
     tables = []
-    for number, trajectory in enumerate(trajectories):
-        columns: dict[str, Any] = {"scenario": scenario.name, "agent": controller.name}
-        columns["policy"] = number
-        columns["seed"] = range(seed, seed + runs)
+    for number, member in enumerate(members):
+        trajectory = member.run(scenario.arguments, scenario.samples, simulated_runs, seed)
+        columns: dict[str, Any] = {
+            "scenario": scenario.name,
+            "agent": controller.name,
+            "policy": number,
+            "seed": range(seed, seed + runs),
+        }
         for name, values in measure(trajectory, scenario.parameters).items():
             columns[name] = np.broadcast_to(values, runs)
+        trajectories.append(trajectory)
         tables.append(pd.DataFrame(columns))
-    seconds = time.process_time() - began
+    seconds = time.process_time() - start
     return Result(
-        scenario.name,
-        controller.name,
-        pd.concat(tables, ignore_index=True),
-        _responses(trajectories, scenario, controller.name),
-        [dict(member.provenance) for member in members if member.provenance],
-        seconds,
-        anticipation(scenario, members, trajectories, runs, seed),
+        scenario=scenario.name,
+        agent=controller.name,
+        runs=pd.concat(tables, ignore_index=True),
+        responses=responses_over_time(trajectories, scenario, controller.name),
+        policies=[dict(member.provenance) for member in members if member.provenance],
+        seconds=seconds,
+        anticipation=anticipation(scenario, members, trajectories, runs, seed),
     )
 
 
-def _responses(
+def responses_over_time(
     trajectories: Sequence[Trajectory], scenario: Scenario, agent: str
 ) -> pd.DataFrame:
     """Return a table of a controller's temperature and flow over time, one row for each sample.
@@ -120,7 +124,8 @@ def _responses(
     The columns are `agent`, `sample`, `time_s` (s), `setpoint` (degC), and four columns each
     for the temperature, `output_...` (degC), and the applied flow, `applied_...` (t/h): `run`
     is the first run, and `median`, `p10` and `p90` are percentiles over all runs of all
-    members. If the set points are random, the percentiles are those of the first run.
+    members. If the set points are random, the percentiles are those of the first run alone, as
+    the runs have different set points.
 
     Parameters
     ----------
@@ -162,7 +167,7 @@ class Scale:
     """
 
     scenario: Scenario
-    least: Any
+    least: LeastPossible
     preview: float
 
 
@@ -174,8 +179,8 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     scenario
         The scenario.
     runs
-        Number of runs. The means are over the episodes of these runs, but at most over
-        `EPISODES` episodes.
+        Number of runs of a controller. The means are over the episodes of these runs, or over
+        the first `EPISODES` of them if there are more, as bounds take long to compute.
     seed
         Seed of the first run; run i has the seed `seed + i`.
 
@@ -184,10 +189,6 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     ValueError
         If no controller can have a smaller error than an idle valve.
     """
-    from benchmarks.bounds.least import (
-        least_possible,
-    )  # imported here, as SciPy is slow to import
-
     arguments = {
         "samples": scenario.samples,
         "episodes": min(runs, EPISODES),
@@ -201,9 +202,7 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
 
 
 def estimate(
-    runs: pd.DataFrame,
-    scales: Mapping[str, Scale],
-    anticipations: Anticipations = MappingProxyType({}),
+    runs: pd.DataFrame, scales: Mapping[str, Scale], anticipations: Anticipations
 ) -> pd.DataFrame:
     """Estimate the mean errors and the scores of controllers, with 95 % confidence intervals.
 
@@ -214,8 +213,8 @@ def estimate(
         number of the member), `seed` and `mae` (the error of the run, degC). The controller in
         the first row is the reference for differences.
     scales : mapping
-        The least possible errors of each scenario, by the scenario's name. Other scenarios are
-        left out.
+        The least possible errors of each scenario, by the scenario's name. Scenarios without
+        least possible errors are left out.
     anticipations : mapping
         The anticipation of each controller that acts before a square wave changes.
 
@@ -229,7 +228,7 @@ def estimate(
         - `mean`: the mean error over the runs, degC, an `Estimate`. If random numbers are used
           and there is only one run, the ends of the interval are infinite;
         - `ratio`: the error ratio, which is `mean` divided by `limit`, an `Estimate`;
-        - `scores`: an array with the score of each run, shape (policies, runs). If the
+        - `scores`: an array with the score of each run, shape (members, runs). If the
           controller anticipates, the scores are those in surprising runs;
         - `mark`: "‡" if the controller anticipates, and otherwise "";
         - `difference`: the mean over the runs of the error minus the error of the reference in
@@ -240,31 +239,28 @@ def estimate(
     reference = runs["agent"].iloc[0]
     rows = []
     for name, scale in scales.items():
-        tables = {}
-        for agent, of_agent in runs[runs["scenario"] == name].groupby("agent", sort=False):
-            table = of_agent.pivot_table(index="policy", columns="seed", values="mae")
-            tables[str(agent)] = table.to_numpy()
-        limit = scale.least.value
-        for agent, errors in tables.items():
+        errors_of = errors_by_agent(runs[runs["scenario"] == name])
+        is_noisy = is_random(scale.scenario.parameters)
+        for agent, errors in errors_of.items():
             mean = bootstrap(errors, seed=BOOTSTRAP_SEED)
-            is_drawn = agent in ROSTER and ROSTER[agent].random
-            if errors.size == 1 and (is_drawn or is_random(scale.scenario.parameters)):
+            draws_numbers = agent in ROSTER and ROSTER[agent].random
+            if errors.size == 1 and (draws_numbers or is_noisy):
                 mean = replace(mean, low=-math.inf, high=math.inf)
             row = {
                 "scenario": name,
                 "agent": agent,
-                "limit": limit,
+                "limit": scale.least.value,
                 "preview": scale.preview,
                 "mean": mean,
-                "ratio": mean.scaled(1 / limit),
+                "ratio": mean.scaled(1 / scale.least.value),
                 "scores": scale.least.score(errors),
                 "mark": "",
             }
             if (name, agent) in anticipations:
                 row["scores"] = anticipations[name, agent].scores
                 row["mark"] = "‡"
-            if agent != reference and reference in tables:
-                reference_errors = tables[reference].mean(axis=0)
+            if agent != reference and reference in errors_of:
+                reference_errors = errors_of[reference].mean(axis=0)
                 differences = errors - reference_errors
                 is_better = (differences < 0.0) + 0.5 * (differences == 0.0)
                 row["difference"] = bootstrap(differences, seed=BOOTSTRAP_SEED)
@@ -273,35 +269,40 @@ def estimate(
     return pd.DataFrame(rows)
 
 
+def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
+    """Return the errors of each controller's runs, degC, shape (members, runs), by its name.
+
+    `runs` has the rows of one scenario, as in `Result`.
+    """
+    errors = {}
+    for agent, rows in runs.groupby("agent", sort=False):
+        table = rows.pivot_table(index="policy", columns="seed", values="mae")
+        errors[str(agent)] = table.to_numpy()
+    return errors
+
+
 def misfits_of(
     controllers: Mapping[str, ControllerSpec], plants: Sequence[Parameters]
 ) -> dict[str, str]:
-    """Return why controllers do not fit some plant: a sentence by the name of the controller.
+    """Return a sentence for each controller that does not fit all plants, by its name.
 
-    Controllers that fit all plants are left out. `controllers` are records by name, and
-    `plants` are the plants of all scenarios.
+    The sentence says why the controller does not fit the first such plant. `controllers` are
+    records by name, and `plants` are the plants of all scenarios.
     """
     misfits: dict[str, str] = {}
     for name, controller in controllers.items():
-        for plant in plants:
-            reason = controller.misfit(plant)
-            if reason:
-                misfits.setdefault(name, reason)
+        reasons = [controller.misfit(plant) for plant in plants]  # "" if the controller fits
+        if any(reasons):
+            misfits[name] = next(filter(None, reasons))
     return misfits
 
 
-def ranked(estimates: pd.DataFrame, misfits: Collection[str] = ()) -> dict[str, Estimate]:
-    """Return the overall score of each controller, by name, in the order of the ranking.
+def ranked(estimates: pd.DataFrame, misfits: Collection[str]) -> dict[str, Estimate]:
+    """Return the overall score of each controller by name, the highest score first.
 
-    The overall score is the mean score over scenarios, members (the trained networks of a
-    controller) and runs. Its 95 % confidence interval is that of `bootstrap`.
-
-    Parameters
-    ----------
-    estimates
-        The table of `estimate`.
-    misfits
-        The names of controllers that do not fit all plants, which come last.
+    The overall score is the mean score over all scenarios, members and runs, with the 95 %
+    confidence interval of `bootstrap`. `estimates` is the table of `estimate`. The controllers
+    in `misfits`, which do not fit all plants, come last.
     """
     scores = {
         str(agent): bootstrap(*tables, seed=BOOTSTRAP_SEED)
@@ -311,10 +312,11 @@ def ranked(estimates: pd.DataFrame, misfits: Collection[str] = ()) -> dict[str, 
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the percentiles over runs, with a row for each scenario, controller and measure.
+    """Return percentiles of the measures of runs, such as the error, over the runs.
 
-    `runs` is a table as in `Result`. The columns of the returned table are `scenario`, `agent`,
-    `metric` (the name of the measure), `runs` (their number), `median`, `p10` and `p90`.
+    There is a row for each scenario, controller and measure, with the columns `scenario`,
+    `agent`, `metric` (the name of the measure), `runs` (the number of runs), `median`, `p10`
+    and `p90`. The argument `runs` has a row for each run, as in `Result`.
     """
     measures = runs.columns.drop(["scenario", "agent", "policy", "seed"])
     rows = []
@@ -334,14 +336,11 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():
-        columns[name] = cells
         if any(isinstance(cell, Estimate) for cell in cells):
-            for end, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
-                ends = pd.Series([getattr(cell, end, math.nan) for cell in cells])
-                columns[f"{name}{suffix}"] = ends.replace([math.inf, -math.inf], math.nan)
-    numbers = pd.DataFrame(columns)
-    for name in numbers:
-        is_infinite = numbers[name] == math.inf
-        if is_infinite.any():
-            numbers[name] = numbers[name].astype(object).mask(is_infinite, "not settled")
-    write_csv(path, numbers)
+            for field, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
+                # A cell without an estimate is NaN, and has no such attribute.
+                numbers = pd.Series([getattr(cell, field, math.nan) for cell in cells])
+                columns[f"{name}{suffix}"] = numbers.replace([math.inf, -math.inf], math.nan)
+        else:
+            columns[name] = cells.replace(math.inf, "not settled")
+    write_csv(path, pd.DataFrame(columns))

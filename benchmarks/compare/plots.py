@@ -30,14 +30,12 @@ LOWEST_SCORE = -0.5
 HIGHEST_SCORE = 0.999
 SCORE_TICKS = LOWEST_SCORE, 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, HIGHEST_SCORE
 SCORE_LABEL = (
-    "score: 0 = idle valve, 1 = least possible error (axis logarithmic in 1 minus the score)"
+    "score: 0 for an idle valve, 1 for the least possible error\n"
+    "(axis logarithmic in 1 minus the score, to show small differences near 1)"
 )
 
 # The look of the band from the 10th to the 90th percentile of the runs.
 BAND: Any = {"alpha": 0.3, "linewidth": 0}
-
-MARKER_SIZE = 6.0  # points
-MARKER_SIZES = {"*": 8.0, "D": 5.0}  # points; these markers then look as large as the others
 
 
 def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: Path) -> None:
@@ -55,84 +53,73 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
     path : Path
         The PNG file.
     """
-    marks = marks_of(list(scores))
-    drawn = [score.value for score in scores.values()]
-    height = 1.3 + 0.3 * len(scores)  # inches: title and axis, and the rows
+    styles = looks(list(estimates["agent"].unique()))
+    drawn_scores = [score.value for score in scores.values()]
+    height = 1.5 + 0.3 * len(scores)  # inches: title and axis, and the rows
     with open_picture(path, height, scores_finding(scores)) as figure:
         axes = figure.subplots()
         for row, (agent, score) in enumerate(scores.items()):
-            mark = marks[agent]
+            colour, marker = styles[agent]
             scores_of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
             scenario_scores = [float(np.mean(values)) for values in scores_of_runs]
-            drawn += scenario_scores
+            drawn_scores += scenario_scores
             rows = np.full(len(scenario_scores), row)
-            ticks: Any = {"color": mark["color"], "marker": "|", "ms": 9, "mew": 1.4, "ls": ""}
-            axes.plot(distance(scenario_scores), rows, **ticks)
-            axes.plot(distance(score.value), row, **mark)
-            place = (1.01, row)  # to the right of the axes
+            tick: Any = {"color": colour, "marker": "|", "ms": 9, "mew": 1.4, "ls": ""}
+            axes.plot(distance(scenario_scores), rows, **tick)
+            axes.plot(distance(score.value), row, color=colour, marker=marker, ms=6.5)
+            right_of_axes = (1.01, row)
             text = written(score.value, ".3f")
-            axes.annotate(text, place, xycoords=("axes fraction", "data"), va="center")
+            axes.annotate(text, right_of_axes, xycoords=("axes fraction", "data"), va="center")
         axes.set_yticks(range(len(scores)), [label(agent) for agent in scores])
-        axes.set_ylim(len(scores) - 0.5, -0.5)
-        _scale_by_score(axes, drawn)
+        axes.set_ylim(len(scores) - 0.5, -0.5)  # The first controller has the top row.
+        scale_by_score(axes, drawn_scores)
         caption = SCORE_LABEL
         if estimates["scenario"].nunique() > 1:
-            caption += "\nlarge marker and number: mean over the cases; small tick: one case"
+            caption += "\nlarge marker and number: mean over all cases; small tick: one case"
         axes.set_xlabel(caption)
 
 
 def scores_finding(scores: Mapping[str, Estimate]) -> str:
-    """Return the title of the picture of scores: who has the highest and the lowest score.
+    """Return the title of the picture of scores, which names the highest and lowest scores.
 
     `scores` has the overall score of each controller by name, the highest score first.
     """
     names = [label(agent) for agent in scores]
     values = [written(score.value, ".3f") for score in scores.values()]
-    first = f"{names[0]} scores highest with {values[0]}"
-    last = f"{names[-1]} scores lowest with {values[-1]}"
     if len(scores) == 1:
-        return f"{names[0]} scores {values[0]}"
-    if len(scores) == 2:
-        return f"{first}; {last}"
-    return f"{first}, {names[1]} follows with {values[1]}; {last}"
-
-
-def marks_of(agents: Sequence[str]) -> dict[str, Any]:
-    """Return keyword arguments of `Axes.plot` that draw the marker of a controller, by name.
-
-    `agents` are the names of the controllers in options.
-    """
-    marks = {}
-    for agent, (colour, marker) in looks(agents).items():
-        size = MARKER_SIZES.get(marker, MARKER_SIZE)
-        marks[agent] = {"color": colour, "marker": marker, "ms": size, "linestyle": ""}
-    return marks
+        return f"{names[0]} has a score of {values[0]}"
+    finding = f"{names[0]} has the highest score ({values[0]})"
+    if len(scores) > 2:
+        finding += f", {names[1]} the second highest ({values[1]})"
+    return f"{finding}, and {names[-1]} the lowest ({values[-1]})"
 
 
 def distance(scores: ArrayLike) -> NDArray[np.float64]:
-    """Return 1 minus each score, for the logarithmic axis; the shape is that of `scores`.
+    """Return 1 minus each score, for the logarithmic axis of scores; shape as `scores`.
 
-    A score beyond an end of the axis of scores is replaced by the score at this end.
+    A score below `LOWEST_SCORE` or above `HIGHEST_SCORE` is first replaced by this limit.
     """
     return 1.0 - np.clip(scores, LOWEST_SCORE, HIGHEST_SCORE)
 
 
-def _scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
-    """Make the x axis of `axes` logarithmic in 1 minus the score, and label ticks with scores.
+def scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
+    """Make the x axis of a panel logarithmic in 1 minus the score, with scores at its ticks.
 
-    `scores` has all scores that are drawn. If a score lies beyond an end of the axis, the label
-    at this end begins with "<" or ">".
+    `scores` has all scores that are drawn. The axis reaches from the last of `SCORE_TICKS`
+    below all scores to the first tick above them. The label of the first or last of
+    `SCORE_TICKS` begins with "≤" or "≥" if scores beyond it are drawn there.
     """
     labels = [f"{score:g}" for score in SCORE_TICKS]
     if min(scores) < LOWEST_SCORE:
-        labels[0] = f"< {labels[0]}"
+        labels[0] = f"≤ {labels[0]}"
     if max(scores) > HIGHEST_SCORE:
-        labels[-1] = f"> {labels[-1]}"
-    start = 1.15 * float(distance(min(0.0, *scores)))
-    end = float(distance(HIGHEST_SCORE)) / 1.3
+        labels[-1] = f"≥ {labels[-1]}"
+    first = max(int(np.searchsorted(SCORE_TICKS, min(scores), side="right")) - 1, 0)
+    last = min(int(np.searchsorted(SCORE_TICKS, max(scores))), len(SCORE_TICKS) - 1)
+    ticks = distance(SCORE_TICKS[first : last + 1])
     axes.set_xscale("log")
-    axes.set_xticks(distance(SCORE_TICKS), labels)
-    axes.set_xlim(start, end)
+    axes.set_xticks(ticks, labels[first : last + 1])
+    axes.set_xlim(1.15 * ticks[0], ticks[-1] / 1.15)
     axes.xaxis.set_minor_locator(NullLocator())
 
 
@@ -155,9 +142,10 @@ def plot_responses(
     path : Path
         The PNG file.
     """
-    agents = errors[responses["agent"].unique()].sort_values(kind="stable").index
-    styles = looks([*agents])
-    title = f"{scenario.title}: {responses_finding(errors[agents])}"
+    errors_drawn = errors[responses["agent"].unique()].sort_values(kind="stable")
+    agents = list(errors_drawn.index)
+    styles = looks(list(errors.index))  # of all controllers, so that colours stay the same
+    title = f"{scenario.title}: {responses_finding(errors_drawn)}"
     height = 1.2 + 1.25 * len(agents)  # inches: title and legend, and the rows
     with open_picture(path, height, title) as figure:
         grid = figure.subplots(len(agents), 2, sharex=True, sharey="col", squeeze=False)
@@ -172,7 +160,11 @@ def plot_responses(
             axes.set_xlim(0.0, responses["time_s"].max() / 60.0)
         entries = _legend_of_responses(responses, scenario.parameters)
         figure.legend(
-            list(entries.values()), list(entries), loc="outside lower center", ncols=4
+            list(entries.values()),
+            list(entries),
+            loc="outside lower center",
+            ncols=4,
+            columnspacing=1.5,
         )
 
 
@@ -186,21 +178,15 @@ def responses_finding(errors: pd.Series[float]) -> str:
     worst = str(errors.index[-1])
     if best == worst:
         return f"the mean error of {label(best)} is {errors[best]:.3f} °C"
-    multiple = errors[worst] / errors[best]
-    return f"the mean error of {label(worst)} is {multiple:.1f} times that of {label(best)}"
+    ratio = errors[worst] / errors[best]
+    return f"{label(worst)} has {ratio:.1f} times the mean error of {label(best)}"
 
 
 def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
     """Draw the set point, the temperature of the first run, and a band of percentiles.
 
-    Parameters
-    ----------
-    axes
-        The panel of the temperature of one controller.
-    rows
-        The rows of `responses`, an argument of `plot_responses`, with this controller.
-    colour
-        The colour of the controller.
+    `axes` is the panel of one controller, and `rows` are this controller's rows of the argument
+    `responses` of `plot_responses`.
     """
     minutes = rows["time_s"] / 60.0
     axes.fill_between(minutes, rows["output_p10"], rows["output_p90"], color=colour, **BAND)
@@ -212,17 +198,9 @@ def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
 def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -> None:
     """Draw the applied flow of the first run, the dead zone, and the limits of the flow.
 
-    Parameters
-    ----------
-    axes
-        The panel of the flow of one controller.
-    rows
-        The rows of `responses`, an argument of `plot_responses`, with this controller.
-    colour
-        The colour of the controller.
-    plant
-        The arguments of the environment. If the dead zone or a limit has a range, the smallest
-        dead zone or the widest limit is drawn.
+    `axes` is the panel of one controller, and `rows` are this controller's rows of the argument
+    `responses` of `plot_responses`. If the dead zone or a limit of the plant has a range, the
+    smallest dead zone or the widest limit is drawn.
     """
     dead_zone = plant.range_of("dead_zone")[0]
     axes.axhspan(-dead_zone, dead_zone, **DEAD_ZONE)
@@ -234,21 +212,17 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
 
 
 def _legend_of_responses(responses: pd.DataFrame, plant: Parameters) -> dict[str, Any]:
-    """Return the lines and patches that the legend shows, by their texts.
-
-    `responses` is the argument of `plot_responses`, and `plant` has the arguments of the
-    environment.
-    """
+    """Return the lines and patches in the legend of `plot_responses`, by their texts."""
     runs_differ = bool((responses["output_p90"] > responses["output_p10"]).any())
     run = Line2D([], [], color="black", linewidth=1.2)
     band = Patch(color="black", **BAND)
     entries: dict[str, Any] = {"set point": Line2D([], [], **SETPOINT)}
     if runs_differ:
-        entries["first run; 10th to 90th percentile of all"] = (band, run)
+        entries["line: first run; band: 10th to 90th percentile"] = (band, run)
     elif plant.setpoint == "random":
         entries["first run"] = run
     smallest = "smallest " if "dead_zone" in plant.ranges else ""
     entries[f"{smallest}dead zone"] = Patch(**DEAD_ZONE)
     widest = "widest " if {"u_min", "u_max"} & set(plant.ranges) else ""
-    entries[f"{widest}limits"] = Line2D([], [], **LIMIT)
+    entries[f"{widest}flow limits"] = Line2D([], [], **LIMIT)
     return entries

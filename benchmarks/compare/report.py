@@ -1,12 +1,13 @@
 """Write the tables, pictures and report of a comparison of controllers in scenarios."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from benchmarks.compare import plots
 from benchmarks.compare.comparison import (
     Anticipations,
     Result,
@@ -25,47 +26,64 @@ from benchmarks.loop.rollout import RESPONSE_SAMPLES, START_SAMPLES
 from benchmarks.loop.scenarios import Scenario
 
 SCORE = (
-    "The score of a controller is the mean of its scores in the cases, with a 95 % interval. "
-    "The valve travel is the mean over all runs. The last columns have the score in each "
-    "case."
+    "The error of a run is the mean of |e| over the samples, where e is the set point minus "
+    "the temperature. An idle valve keeps the flow at 0 t/h. The score says which share of the "
+    "way from the error of an idle valve to the least possible error a controller covers. "
+    "The column 'score' has the mean score over all cases, with a 95 % confidence "
+    "interval, and the columns of the cases have the score in each case. The valve travel is "
+    "the sum of all changes of the applied flow in a run, as a mean over all runs."
 )
-BOUND = (
-    "The first row is the least possible error of a controller without foresight. The mark * "
-    "means that the plant has settled before each change of the set point. In a case with "
-    "this mark, a controller that knows when the set point changes can have a smaller error, "
-    "down to the error in the second row."
+RATIO = (
+    "An error ratio of 1.00 is best. The first row has the least possible error of a "
+    "controller that does not know future set points, and the second row has the least "
+    "possible error of a controller that knows them. The mark * means that the plant settles "
+    "before each change of the set point, and that the error in the first row assumes that "
+    "each change comes as a surprise. In a case with the mark *, a controller that has learnt "
+    "when the set point changes can have an error ratio below 1.00."
 )
 ANTICIPATES = (
     "‡ The controller moves the valve before the square wave changes. Its score in this case "
     "is the score in runs with the same seeds in which nobody can foresee the changes."
 )
 SURPRISED = (
-    "These controllers move the valve before the square wave changes. The column 'moved "
-    "before the change' has the share of a change that the temperature has made before it can "
-    "respond to the change. A controller that knows the period of the square wave can reach "
-    "the error with foresight. The last column is the error ratio in runs whose changes "
-    "nobody can foresee."
+    "The controllers in this table move the valve before the square wave changes. The column "
+    "'moved before the change' has the share of a set-point change that the temperature makes "
+    "before it can respond to the change. The columns 'least possible' and 'with foresight' "
+    "have the least possible errors of controllers that do not know future set points, and of "
+    "controllers that know them. The last column has the error ratio in runs in which nobody "
+    "can foresee the changes."
 )
 PAIRED = (
-    "If a difference is below 0 °C, the controller has a smaller error than the controller in "
-    "the heading. The percentage is the share of runs in which its error is smaller."
+    "The reference is the controller that was named first, here {reference}. A cell has the "
+    "error of a controller minus the error of the reference in the same run, in °C: the mean "
+    "over the runs, with a 95 % confidence interval. A negative difference means that the "
+    "controller has the smaller error. The percentage is the share of the runs in which the "
+    "controller has the smaller error."
 )
 HARD = (
-    "The mean error is the sum of the contributions of three parts of a run. All columns are "
-    "in °C."
+    "The mean error on the preset hard, in °C, is the sum of three contributions: those of the "
+    f"first {START_SAMPLES} samples of a run, of the {RESPONSE_SAMPLES} samples after each later change of the "
+    "set point, and of the remaining samples."
 )
-ROBUST = (
-    "The loop of a linear controller has an Ms, which is the largest magnitude of its "
-    "sensitivity function, and a range of delays with which the loop is stable. Both are "
-    "computed for the nominal plant of the first case, away from the dead zone and the "
-    "limits. PI (SIMC), Smith and Dahlin are tuned to the same Ms."
+COSTS = (
+    "The column 'prior knowledge' says what a controller knows about the plant before a run, "
+    "and the column 'searched or trained' says how its settings or weights were found; 1 M "
+    "samples are a million samples. Ms is the maximum sensitivity of a control loop, the "
+    "largest magnitude of its sensitivity function: the lower Ms is, the more robust is the "
+    "loop. Ms and the range of delays with which the loop is stable are given for linear "
+    "controllers, with the nominal plant of the first case, without dead zone and limits."
 )
+CASES = (
+    "Each case is the environment MiddlePoint-v0 with the arguments in the last column; all "
+    "other arguments have their default values."
+)
+MOST_ROWS = 8  # largest number of controllers in a picture of temperature and flow over time
 MISFIT = "†"  # marks controllers that were made for another plant
 PARTS = {  # the columns of a part of the mean error, and of the mean error
     "mae_start": f"first {START_SAMPLES} samples",
     "mae_changes": f"{RESPONSE_SAMPLES} samples after later changes",
-    "mae_steady": "the rest",
-    "mae": "together",
+    "mae_steady": "remaining samples",
+    "mae": "mean error",
 }
 
 
@@ -105,6 +123,24 @@ class Comparison:
     misfits: Mapping[str, str]
     scores: Mapping[str, Estimate]
 
+    @property
+    def ranked(self) -> list[str]:
+        """The names of the controllers that fit all plants, the best first."""
+        return [name for name in self.scores if name not in self.misfits]
+
+    @property
+    def pictured(self) -> list[str]:
+        """The names of the controllers that are drawn over time, the best first.
+
+        They are the `ranked` controllers, or all controllers if none is ranked. If there are
+        more than `MOST_ROWS`, they are only those whose record has `pictured` true.
+        """
+        names = self.ranked or list(self.scores)
+        chosen = [name for name in names if self.controllers[name].pictured]
+        if len(names) > MOST_ROWS and chosen:
+            return chosen
+        return names
+
 
 def write(
     results: Sequence[Result],
@@ -137,10 +173,8 @@ def write(
         tables = [result.responses for result in results if result.scenario == name]
         responses[name] = pd.concat(tables)
         write_numbers(folder / f"{name}.csv", responses[name])
-    scale_of = {}
-    for scale in scales:
-        if scale.scenario.name in responses:
-            scale_of[scale.scenario.name] = scale
+    scale_of = {scale.scenario.name: scale for scale in scales}
+    scale_of = {name: scale for name, scale in scale_of.items() if name in responses}
     runs = runs[runs["scenario"].isin(list(scale_of))]
     if runs.empty:
         return
@@ -170,10 +204,6 @@ def write(
 def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:
     """Draw the scores, and the temperature and flow over time in each scenario.
 
-    Controllers that do not fit the plants have no scores in the picture. Temperature and flow
-    are drawn for the controllers whose record has `pictured` true, or for all controllers if
-    there is no such record.
-
     Parameters
     ----------
     comparison
@@ -184,79 +214,68 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
     folder
         The folder of the PNG files.
     """
-    from benchmarks.compare import plots  # imported here, as matplotlib is slow to import
-
-    runs = comparison.runs
-    misfits = comparison.misfits
-    fitting = {
-        name: comparison.scores[name] for name in comparison.scores if name not in misfits
-    }
-    if fitting:
-        plots.plot_scores(fitting, comparison.estimates, folder / "scores.png")
-    pictured = [name for name in fitting if comparison.controllers[name].pictured]
-    errors = runs.groupby(["scenario", "agent"])["mae"].mean()
+    scores = {name: comparison.scores[name] for name in comparison.ranked}
+    if scores:
+        plots.plot_scores(scores, comparison.estimates, folder / "scores.png")
+    errors = comparison.runs.groupby(["scenario", "agent"])["mae"].mean()
     for name, scale in comparison.scales.items():
         rows = responses[name]
-        if rows["agent"].isin(pictured).any():
-            rows = rows[rows["agent"].isin(pictured)]
-        plots.plot_responses(rows, errors[name], scale.scenario, folder / f"{name}.png")
+        rows = rows[rows["agent"].isin(comparison.pictured)]
+        if not rows.empty:  # The tasks of all pictured controllers may have failed.
+            plots.plot_responses(rows, errors[name], scale.scenario, folder / f"{name}.png")
 
 
 def sections(comparison: Comparison) -> list[Section]:
-    """Return the sections of the report whose tables have at least one row."""
+    """Return the sections of the report, without those whose table has no row."""
     reference = label(str(comparison.runs["agent"].iloc[0]))
-    first_scale = next(iter(comparison.scales.values()))
-    titles = {name: scale.scenario.title for name, scale in comparison.scales.items()}
+    scenarios = [scale.scenario for scale in comparison.scales.values()]
     candidates = [
         Section(
             "Score: 0 for an idle valve, 1 for the least possible error",
             [SCORE, *notes(comparison)],
-            score_table(
-                comparison.runs, comparison.estimates, comparison.scores, comparison.misfits
-            ),
-            pictures={
-                "scores.png": "The score of each controller, and a small tick for each case"
-            },
+            score_table(comparison),
+            pictures={"scores.png": "The score of each controller, and its score in each case"},
         ),
         Section(
-            "Error ratio: mean error / least possible error, with its 95 % interval",
-            [BOUND],
-            ratio_table(comparison.estimates, comparison.scales, list(comparison.scores)),
+            "Error ratio: mean error / least possible error, with a 95 % confidence interval",
+            [RATIO],
+            ratio_table(comparison),
         ),
         Section(
-            "Anticipation: who moves before the square wave changes",
+            "Anticipation: controllers that act before the square wave changes",
             [SURPRISED],
-            anticipation_table(comparison.anticipations, comparison.estimates),
+            anticipation_table(comparison),
         ),
         Section(
-            f"Difference to {reference} (°C), 95 % interval",
-            [PAIRED],
-            difference_table(comparison.estimates),
+            f"Difference to the error of the reference: {reference}",
+            [PAIRED.format(reference=reference)],
+            difference_table(comparison),
         ),
         Section(
-            "Where the error arises: hard",
+            "Where the error arises on the preset hard",
             [HARD],
             parts_table(comparison.runs),
         ),
         Section(
             "What each controller knows and costs",
-            [ROBUST],
-            costs_table(comparison.results, comparison.controllers, first_scale.scenario),
+            [COSTS],
+            costs_table(comparison.results, comparison.controllers, scenarios[0]),
         ),
         Section(
             "Cases",
-            table=pd.DataFrame(titles.items(), columns=["case", "what it is"]),
+            notes_on_cases(comparison, scenarios),
+            cases_table(scenarios),
             pictures={
-                f"{name}.png": f"Temperature and applied flow over time: {title}"
-                for name, title in titles.items()
+                f"{scenario.name}.png": f"Temperature and flow over time: {scenario.title}"
+                for scenario in scenarios
             },
         ),
     ]
     marks = {label(name): f"{label(name)} {MISFIT}" for name in comparison.misfits}
     filled = []
     for section in candidates:
-        table = section.table
-        if table is None or table.empty:
+        table: Any = section.table
+        if table.empty:
             continue
         if "controller" in table:
             table["controller"] = table["controller"].replace(marks)
@@ -265,7 +284,10 @@ def sections(comparison: Comparison) -> list[Section]:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return sentences on controllers that are not ranked, or ranked by surprising runs."""
+    """Return sentences on controllers that are not ranked, or ranked by surprising runs.
+
+    The notes of users' own controllers, such as on a missing environment, come first.
+    """
     texts = {
         str(policy["note"])
         for result in comparison.results
@@ -281,104 +303,92 @@ def notes(comparison: Comparison) -> list[str]:
     return [*sorted(texts), *not_ranked]
 
 
-def score_table(
-    runs: pd.DataFrame,
-    estimates: pd.DataFrame,
-    scores: Mapping[str, Estimate],
-    misfits: Collection[str] = (),
-) -> pd.DataFrame:
+def notes_on_cases(comparison: Comparison, scenarios: Sequence[Scenario]) -> list[str]:
+    """Return the paragraphs above the table of cases: what it has, and who is in the pictures.
+
+    `scenarios` are all scenarios of the report.
+    """
+    texts = [CASES]
+    if any("Figs" in scenario.title for scenario in scenarios):
+        texts.append("Figs are the figures of the paper by Cui and Shin (1992).")
+    if len(comparison.pictured) < len(comparison.controllers):
+        names = ", ".join(label(name) for name in comparison.pictured)
+        texts.append(f"The pictures show these controllers: {names}.")
+    return texts
+
+
+def score_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts with the scores and the mean valve travel of each controller.
 
-    Parameters
-    ----------
-    runs
-        A row for each run, as in `comparison.Result`.
-    estimates
-        The table of `comparison.estimate`.
-    scores
-        The overall score of each controller by name, in the order of the rows of the result.
-    misfits
-        The names of controllers that do not fit the plants, which are shown as "not ranked".
+    The controllers have the order of their overall scores. A controller that does not fit the
+    plants is "not ranked".
     """
-    agents = list(scores)
+    estimates = comparison.estimates
+    agents = list(comparison.scores)
     cells = estimates["scores"].map(lambda scores: written(scores.mean(), ".2f"))
     table = _by_agent(estimates, cells + estimates["mark"], agents)
-    travels = runs.groupby(["agent", "scenario"])["total_variation"].mean()
+    travels = comparison.runs.groupby(["agent", "scenario"])["total_variation"].mean()
     overall = []
-    for agent, score in scores.items():
-        overall.append("not ranked" if agent in misfits else f"{score:.3f}")
+    for agent, score in comparison.scores.items():
+        overall.append("not ranked" if agent in comparison.misfits else f"{score:.3f}")
     table.insert(1, "score", overall)
     table.insert(2, "travel (t/h)", [f"{travels[agent].mean():,.0f}" for agent in agents])
     return table
 
 
-def ratio_table(
-    estimates: pd.DataFrame, scales: Mapping[str, Scale], agents: Sequence[str]
-) -> pd.DataFrame:
+def ratio_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts with least possible errors and error ratios in each scenario.
 
     The first two rows have the least possible errors without and with knowledge of future set
-    points, degC. The other rows have the error ratios of the controllers.
-
-    Parameters
-    ----------
-    estimates
-        The table of `comparison.estimate`.
-    scales
-        The least possible errors in each scenario, by the name of the scenario.
-    agents
-        The names of the controllers, in the order of the rows.
+    points, degC. Each other row has the error ratios of a controller.
     """
     bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
-    for name, scale in scales.items():
+    for name, scale in comparison.scales.items():
         mark = "*" if scale.least.kind == "reference" else ""
         bounds[name] = [f"{scale.least.value:.3f}{mark}", f"{scale.preview:.3f}"]
+    estimates = comparison.estimates
     cells = estimates["ratio"].map("{:.2f}".format) + estimates["mark"]
-    return pd.concat([bounds, _by_agent(estimates, cells, agents)], ignore_index=True)
+    ratios = _by_agent(estimates, cells, list(comparison.scores))
+    return pd.concat([bounds, ratios], ignore_index=True)
 
 
-def anticipation_table(anticipations: Anticipations, estimates: pd.DataFrame) -> pd.DataFrame:
+def anticipation_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts on the controllers that act before a square wave changes.
 
-    There is a row for each scenario and controller in `anticipations`. `estimates` is the table
-    of `comparison.estimate`.
+    There is a row for each scenario and controller in `comparison.anticipations`.
     """
+    estimates = comparison.estimates
     rows = []
-    for row in estimates.to_dict("records"):
-        anticipation = anticipations.get((row["scenario"], row["agent"]))
-        if anticipation is None:
-            continue
-        rows.append(
-            {
-                "case": row["scenario"],
-                "controller": label(row["agent"]),
-                "moved before the change (%)": f"{anticipation.movement.scaled(100.0):.0f}",
-                "mean error (°C)": f"{row['mean'].value:.3f}",
-                "without foresight": f"{row['limit']:.3f}",
-                "with foresight": f"{row['preview']:.3f}",
-                "error ratio": f"{row['ratio'].value:.2f}",
-                "error ratio where changes surprise": f"{anticipation.ratio:.2f}",
-            }
-        )
+    for estimated in estimates[estimates["mark"] != ""].to_dict("records"):
+        agent = estimated["agent"]
+        anticipation = comparison.anticipations[estimated["scenario"], agent]
+        row = {
+            "case": estimated["scenario"],
+            "controller": label(agent),
+            "moved before the change (%)": f"{anticipation.movement.scaled(100.0):.0f}",
+            "mean error (°C)": f"{estimated['mean'].value:.3f}",
+            "least possible (°C)": f"{estimated['limit']:.3f}",
+            "with foresight (°C)": f"{estimated['preview']:.3f}",
+            "error ratio": f"{estimated['ratio'].value:.2f}",
+            "error ratio without foresight": f"{anticipation.ratio:.2f}",
+        }
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
-def difference_table(estimates: pd.DataFrame) -> pd.DataFrame:
+def difference_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts that compares the errors with those of the reference controller.
 
     A cell has the mean difference of the errors, degC, and the share of the runs in which the
-    error is smaller than that of the reference. `estimates` is the table of
-    `comparison.estimate`. If there is only one controller, the result is empty.
+    error is smaller than that of the reference. If there is only one controller, the table is
+    empty.
     """
-    if "difference" not in estimates:
+    if "difference" not in comparison.estimates:
         return pd.DataFrame()
-    compared = estimates.dropna(subset=["difference"])
-    cells = []
-    for difference, improvement in zip(
-        compared["difference"], compared["improvement"], strict=True
-    ):
-        cells.append(f"{difference:+.3f}; {100 * improvement.value:.0f} %")
-    return _by_agent(compared, cells, list(compared["agent"].unique()))
+    compared = comparison.estimates.dropna(subset=["difference"])
+    differences = compared["difference"].map("{:+.3f}".format)
+    shares = compared["improvement"].map(lambda share: f"{100 * share.value:.0f} %")
+    return _by_agent(compared, differences + "; " + shares, list(compared["agent"].unique()))
 
 
 def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
@@ -407,6 +417,21 @@ def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
     means = runs[runs["scenario"] == "hard"].groupby("agent")[list(PARTS)].mean()
     texts = means.sort_values("mae").map("{:.3f}".format)
     return texts.rename(index=label, columns=PARTS).rename_axis("controller").reset_index()
+
+
+def cases_table(scenarios: Sequence[Scenario]) -> pd.DataFrame:
+    """Return a table of texts that describes scenarios, with a row for each scenario."""
+    rows = []
+    for scenario in scenarios:
+        arguments = [f"{name}={value}" for name, value in scenario.arguments.items()]
+        row = {
+            "case": scenario.name,
+            "description": scenario.title,
+            "length (samples)": f"{scenario.samples:,}",
+            "arguments": ", ".join(arguments) or "none",
+        }
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def costs_table(

@@ -118,13 +118,14 @@ def trained(kind: type[PolicyNetwork | RecurrentNetwork], files: str) -> Mapping
 
 _STEP_TEST = "gain, time constant, delay"
 _DATA_SHEET = f"{_STEP_TEST}, dead zone, limits"
+_NN_KNOWS = "sign of the gain; settings searched on the paper's plant"
 _NN = (
-    "25 weights in the run itself; 6 gains by the search of version 0.1; a search of today "
+    "25 weights in the run itself; 6 settings by the search of version 0.1; the present search "
     "takes 800 trials: 566 M samples, 6 min"
 )
 _HOLDS = "hold times of random set points"
 _LAW = "8,313 weights for all plants: 12.8 M samples a network, 5 min; 90 settings by hand"
-_RULE = f"nothing: one step test, a rule, slowed down to Ms {ROBUSTNESS:g}"
+_RULE = f"one time constant, by a tuning rule and an Ms of {ROBUSTNESS:g}; one step test"
 _NETWORK = partial(trained, RecurrentNetwork, "neural-[0-9]*.npz")
 _SPECS = (
     ControllerSpec(
@@ -144,7 +145,7 @@ _SPECS = (
         look=("#D55E00", "o"),
         build=DirectNNController,
         prior_knowledge=DIRECTION,
-        knows="direction; gains searched on the paper's plant",
+        knows=_NN_KNOWS,
         searched=_NN,
         assumes=("scale",),
         random=True,
@@ -158,8 +159,8 @@ _SPECS = (
         look=("#7A3600", "o"),
         build=frozen_nn,
         prior_knowledge=EVERYTHING,
-        knows="direction; gains searched on the paper's plant",
-        searched=f"{_NN}; 1,200 samples before",
+        knows=_NN_KNOWS,
+        searched=f"{_NN}; 1,200 samples of learning before the run",
         assumes=("scale",),
         random=True,
         compared=False,
@@ -170,7 +171,7 @@ _SPECS = (
         look=("#CC79A7", "s"),
         build=PIController,
         knows="gains of the paper, for its plant",
-        searched="2 gains, not stated how",
+        searched="2 gains; the paper does not say how they were found",
         linear=True,
         assumes=("direction", "scale"),
         spans=plant_scale.pi_spans,
@@ -192,9 +193,9 @@ _SPECS = (
         label="PI (searched)",
         look=("#5A1220", "p"),
         build=partial(PIController, kp=SEARCHED_GAINS["kp"], ki=SEARCHED_GAINS["ki"]),
-        knows="gains of the search, for the paper's plant",
-        searched="2 gains by an earlier version of the search; one of today takes 800 trials: "
-        "566 M samples, 3 min",
+        knows="gains searched on the paper's plant",
+        searched="2 gains by an earlier version of the search; the present search takes 800 "
+        "trials: 566 M samples, 3 min",
         linear=True,
         assumes=("direction", "scale"),
         swept=False,
@@ -230,7 +231,7 @@ _SPECS = (
         build=partial(with_bank, SelfTuningController),
         prior_knowledge=BANK,
         knows=f"{_DATA_SHEET}; delay range; {_HOLDS}",
-        searched="30 settings by hand; one step test",
+        searched="about 70 settings by hand; one step test",
     ),
     ControllerSpec(
         name="mpc",
@@ -238,7 +239,7 @@ _SPECS = (
         look=("#000000", "*"),
         build=PredictiveController,
         prior_knowledge=EVERYTHING,
-        knows="everything but the future",
+        knows="everything except the future",
         searched="nothing",
         swept=False,
     ),
@@ -261,7 +262,7 @@ _SPECS = (
         look=("#8F6200", "D"),
         build=with_policy,
         prior_knowledge=("parameters", *LIMITS),
-        knows="limits; trained on a simulator of the plants of `hard`",
+        knows="limits; trained on a simulator of the plants of the preset hard",
         searched="12,608 weights on plants that vary: 4 M samples a policy; settings by 43 "
         "trials: 36 M samples, 12 min",
         assumes=("direction", "scale"),
@@ -316,10 +317,9 @@ def looks(agents: Sequence[str]) -> dict[str, tuple[str, str]]:
     """Return the colour and the marker, for matplotlib, of each controller by its name.
 
     `agents` are the names of controllers in options. The controllers that are not in `ROSTER`,
-    which are a user's own, get the colours and markers of `OWN_LOOKS` in turn.
+    which are a user's own, get the colours and markers of `OWN_LOOKS` in turn, in the order of
+    their names, so that the order of `agents` does not matter.
     """
-    own_looks = itertools.cycle(OWN_LOOKS)
-    looks = {}
-    for agent in agents:
-        looks[agent] = ROSTER[agent].look if agent in ROSTER else next(own_looks)
-    return looks
+    own_names = sorted(agent for agent in agents if agent not in ROSTER)
+    own_looks = dict(zip(own_names, itertools.cycle(OWN_LOOKS), strict=False))
+    return {agent: own_looks.get(agent) or ROSTER[agent].look for agent in agents}

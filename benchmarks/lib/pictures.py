@@ -7,19 +7,16 @@ dark page. The title of a picture is a sentence that says what the picture shows
 
 from __future__ import annotations
 
-import math
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -49,7 +46,9 @@ SETPOINT: Any = {"color": "black", "linestyle": "--", "linewidth": 0.8}
 DEAD_ZONE: Any = {"color": "0.5", "alpha": 0.2, "linewidth": 0}
 LIMIT: Any = {"color": "0.4", "linestyle": ":", "linewidth": 1.0}
 
-RATIO_LABEL = "error / least possible error\n(axis logarithmic in the ratio minus 1)"
+RATIO_LABEL = (
+    "error ratio: mean error / least possible error\n(axis logarithmic in the ratio minus 1)"
+)
 # The smallest error ratio that is drawn; smaller ratios are drawn at this ratio. An error ratio
 # of 1 would lie at minus infinity on an axis that is logarithmic in the ratio minus 1.
 RATIO_FLOOR = 1.001
@@ -84,95 +83,14 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
 
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, height))
-        sentence = textwrap.fill(title[0].upper() + title[1:], TITLE_CHARACTERS)
-        figure.suptitle(sentence, x=0.015, ha="left", fontsize=10, weight="bold")
+        sentence = title[0].upper() + title[1:]
+        lines = textwrap.wrap(sentence, TITLE_CHARACTERS, break_on_hyphens=False)
+        figure.suptitle("\n".join(lines), x=0.015, ha="left", fontsize=10, weight="bold")
         yield figure
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()  # `Figure.savefig` would draw twice because of the layout.
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     picture.quantize(PALETTE, Image.Quantize.FASTOCTREE).save(path)
-
-
-@dataclass(frozen=True)
-class Panels:
-    """A figure with a grid of panels, such as one panel for each controller.
-
-    Attributes
-    ----------
-    figure : Figure
-        The figure.
-    axes : sequence of Axes
-        The panels, row by row.
-    unused : sequence of Axes
-        The invisible axes that fill the last row of the grid behind the last panel.
-    columns : int
-        Number of panels in a full row.
-    """
-
-    figure: Figure
-    axes: Sequence[Axes]
-    unused: Sequence[Axes]
-    columns: int
-
-    def label_edges(self, x: str, y: str) -> None:
-        """Write the label `y` at the left of each row, and the label `x` below each column."""
-        for panel in self.axes[:: self.columns]:
-            panel.set_ylabel(y)
-        for panel in self.axes[-self.columns :]:
-            panel.set_xlabel(x)
-
-    def add_legend(self, entries: Mapping[str, Artist], columns: int) -> None:
-        """Add a legend in the unused part of the last row of panels, or below all panels.
-
-        Parameters
-        ----------
-        entries
-            The line or patch that the legend shows beside each text, by the text.
-        columns
-            Number of columns of a legend below all panels. A legend in the last row has one
-            column.
-        """
-        handles = list(entries.values())
-        texts = list(entries)
-        if self.unused:
-            legend = self.unused[0].legend(handles, texts, loc="center left")
-            legend.set_in_layout(False)  # It may be wider than a panel.
-            return
-        self.figure.legend(handles, texts, loc="outside lower center", ncols=columns)
-
-
-@contextmanager
-def open_panels(
-    path: Path, names: Sequence[str], height: float, columns: int, title: str
-) -> Iterator[Panels]:
-    """Yield a figure with a grid of panels, to be drawn on in the block of a `with` statement.
-
-    The figure is saved as a PNG file when the block ends without an error.
-
-    Parameters
-    ----------
-    path : Path
-        The PNG file.
-    names : sequence of str
-        The heading of each panel.
-    height : float
-        Height of a panel, inches.
-    columns : int
-        Largest number of panels in a row.
-    title : str
-        A sentence above the figure.
-    """
-    columns = min(columns, len(names))
-    rows = math.ceil(len(names) / columns)
-    with open_picture(path, height * rows + 1.2, title) as figure:
-        places = list(figure.subplots(rows, columns, squeeze=False).flat)
-        axes = places[: len(names)]
-        unused = places[len(names) :]
-        for panel, name in zip(axes, names, strict=True):
-            panel.set_title(name)
-        for panel in unused:
-            panel.set_axis_off()
-        yield Panels(figure, axes, unused, columns)
 
 
 def excess(ratios: ArrayLike) -> NDArray[np.float64]:
@@ -183,28 +101,19 @@ def excess(ratios: ArrayLike) -> NDArray[np.float64]:
     return np.maximum(ratios, RATIO_FLOOR) - 1.0
 
 
-def scale_by_ratio(axes: Axes, direction: Literal["x", "y"], ratios: ArrayLike) -> None:
-    """Make the axis on which `excess(ratios)` is drawn logarithmic, with labels for ratios.
+def scale_by_ratio(axes: Axes, ratios: ArrayLike) -> None:
+    """Make the y axis of `excess(ratios)` logarithmic, with error ratios at its ticks.
 
-    Parameters
-    ----------
-    axes
-        The panel.
-    direction
-        The axis of the panel, "x" or "y".
-    ratios
-        All error ratios in the panel, which set the ends of the axis. If one of the ratios is
-        below `RATIO_FLOOR`, the label of the lowest tick is "< 1.001" in place of "1.001".
+    `ratios` are all error ratios in the panel, which set the ends of the axis. If a ratio is
+    below `RATIO_FLOOR`, the label of the lowest tick is "≤ 1.001" in place of "1.001".
     """
-    from matplotlib import ticker
+    from matplotlib.ticker import NullLocator
 
-    values = excess(ratios)
+    heights = excess(ratios)
     labels = [f"{ratio:g}" for ratio in RATIO_TICKS]
     if np.min(ratios) < RATIO_FLOOR:
-        labels[0] = f"< {labels[0]}"
-    limits = (values.min() / 1.4, values.max() * 1.4)
-    axes.set(**{f"{direction}scale": "log", f"{direction}lim": limits})
-    axis = getattr(axes, f"{direction}axis")
-    axis.set_major_locator(ticker.FixedLocator([ratio - 1.0 for ratio in RATIO_TICKS]))
-    axis.set_major_formatter(ticker.FixedFormatter(labels))
-    axis.set_minor_locator(ticker.NullLocator())
+        labels[0] = f"≤ {labels[0]}"
+    axes.set_yscale("log")
+    axes.set_yticks(excess(RATIO_TICKS), labels)
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_ylim(heights.min() / 1.4, heights.max() * 1.4)

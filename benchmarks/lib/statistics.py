@@ -85,7 +85,9 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     too few runs. The interval assumes nothing about the distribution of the values.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
-    value = percentiles(ordered, value=100.0 * probability)["value"]
+    # An infinite value cannot be interpolated.
+    method: Any = "linear" if np.isfinite(ordered).all() else "higher"
+    value = np.quantile(ordered, probability, method=method)
     interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval()
     low = float(interval.low)
     if math.isnan(low):
@@ -142,26 +144,19 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
     return Estimate(mean, float(low), float(high), all_values.size)
 
 
-def percentiles(
-    values: NDArray[np.float64], method: Any = "linear", **percents: float
-) -> dict[str, Any]:
-    """Return percentiles over runs by name: each a float or an array of shape (...).
+def percentiles(values: NDArray[np.float64], method: Any = "linear") -> dict[str, Any]:
+    """Return the median and the 10th and 90th percentile over runs, as `median`, `p10`, `p90`.
 
     Parameters
     ----------
     values
-        The values, shape (..., runs). The last axis is reduced.
+        The values, shape (..., runs). The results have the shape (...).
     method
         The method of `numpy.percentile`. If some values are infinite, such as the settling time
         of a run that never settles, the method "higher" is used in place of this one, since an
         infinite value cannot be interpolated.
-    percents
-        Percentages from 0 to 100 by name; by default `median=50, p10=10, p90=90`.
     """
     if not np.isfinite(values).all():
         method = "higher"
-    percents = percents or {"median": 50, "p10": 10, "p90": 90}
-    return {
-        name: np.percentile(values, percent, axis=-1, method=method)
-        for name, percent in percents.items()
-    }
+    median, p10, p90 = np.percentile(values, (50, 10, 90), axis=-1, method=method)
+    return {"median": median, "p10": p10, "p90": p90}

@@ -7,6 +7,7 @@ title of a picture is a sentence on the results in it.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ from benchmarks.controllers.roster import label, looks
 from benchmarks.lib.pictures import (
     RATIO_LABEL,
     excess,
-    open_panels,
     open_picture,
     percent,
     scale_by_ratio,
@@ -32,6 +32,7 @@ from mptc_gym import Parameters
 
 NEAR = 1.05  # largest error ratio that counts as near the least possible error
 OFTEN = 0.5  # smallest share of the runs on a plant that fail for a mark in the map
+MOST_COLUMNS = 3  # number of maps in a row
 CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
 COLOUR_MAP = "viridis_r"  # light for small error ratios, dark for large ones
 NO_RATIO = "0.85"  # colour of a plant without a least possible error
@@ -97,11 +98,11 @@ def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
             look: Any = {"color": colour, "marker": marker, "ms": 5, "markevery": 0.1}
             axes.plot(shares, excess(ratios), label=label(agent), linewidth=1.3, **look)
         if styles:
-            scale_by_ratio(axes, "y", plants["ratio"])
+            scale_by_ratio(axes, plants["ratio"])
             # The controller with the largest errors is the uppermost line.
             figure.legend(loc="outside right center", reverse=True)
         axes.set_xlim(0.0, 100.0)
-        axes.set_xlabel("share of the plants (%), sorted by the error of each controller")
+        axes.set_xlabel("share of the plants (%), sorted by the error ratio of each controller")
         axes.set_ylabel(RATIO_LABEL)
 
 
@@ -135,22 +136,35 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
         The nominal plant, which each map marks.
     """
     agents = list(plants["agent"].unique())
-    names = [label(agent) for agent in agents]
+    columns = min(MOST_COLUMNS, len(agents))
+    rows = math.ceil(len(agents) / columns)
     classes = BoundaryNorm(CLASSES, ncolors=256, extend="max")
     centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
-    with open_panels(path, names, 1.9, 3, map_finding(plants)) as panels:
-        for axes, agent in zip(panels.axes, agents, strict=True):
+    height = 1.5 + 1.9 * rows  # inches: title, legend and colour bar, and the rows
+    with open_picture(path, height, map_finding(plants)) as figure:
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes in panels[len(agents) :]:
+            axes.set_axis_off()
+        for number, agent in enumerate(agents):
+            axes = panels[number]
+            axes.set_title(label(agent))
             _draw_controller(axes, plants[plants["agent"] == agent], classes)
             axes.plot(*centre, **NOMINAL)
-        panels.label_edges("delay (samples)", "gain factor")
-        panels.add_legend(_legend_of_map(plants), columns=4)
-        bar = panels.figure.colorbar(
+            if number % columns == 0:
+                axes.set_ylabel("gain factor")
+            if number >= len(agents) - columns:  # no panel below this one
+                axes.set_xlabel("delay (samples)")
+        marks = _legend_of_map(plants)
+        figure.legend(
+            list(marks.values()), list(marks), loc="outside lower center", ncols=MOST_COLUMNS
+        )
+        bar = figure.colorbar(
             ScalarMappable(classes, COLOUR_MAP),
-            ax=panels.figure.axes,
+            ax=list(panels),
             location="bottom",
             aspect=60,
         )
-        bar.set_label("error / least possible error")
+        bar.set_label("error ratio: mean error / least possible error")
         bar.set_ticks(CLASSES, labels=[f"{ratio:g}" for ratio in CLASSES])
 
 
@@ -175,7 +189,7 @@ def map_finding(plants: pd.DataFrame) -> str:
     if len(names) > 1:
         finding += f", {names[1]} on {percentages[1]}"
     if len(names) > 2:
-        finding += "; no other controller is on more"
+        finding += f", and every other controller on at most {percentages[2]}"
     return finding
 
 
@@ -209,9 +223,9 @@ def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
     """
     entries: dict[str, Artist] = {"the nominal plant": Line2D([], [], **NOMINAL)}
     if (plants["oscillates"] >= OFTEN).any():
-        entries["oscillates"] = Line2D([], [], **OSCILLATES)
+        entries["oscillation in most runs"] = Line2D([], [], **OSCILLATES)
     if (plants["useless"] >= OFTEN).any():
-        entries["no better than idle"] = Patch(color=USELESS)
+        entries["no better than an idle valve in most runs"] = Patch(color=USELESS)
     if plants["ratio"].isna().any():
         entries["least possible error unknown"] = Patch(color=NO_RATIO)
     return entries

@@ -1,0 +1,406 @@
+"""Make the runs that examine the paper's claims, and judge their results by criteria.
+
+The paper is that of Cui and Shin (1992), whose controller is a neural network (NN) that learns
+online. Each function that takes a `Batch` and yields `Findings` examines a claim, or two claims
+that differ in an argument. `benchmarks.claims.claims` has the words of the claims.
+"""
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping
+from functools import partial
+
+import numpy as np
+import pandas as pd
+
+from agents import DirectNNController, PIController
+from benchmarks.claims.findings import OFTEN, Finding, judge, judge_share, judge_times
+from benchmarks.claims.runs import PAPER_LENGTH, Batch, WeightLog, converged_at
+from benchmarks.loop import linear
+from benchmarks.loop.rollout import mean_error, settled
+from benchmarks.loop.scenarios import SETPOINTS as PAPER_SETPOINTS
+from benchmarks.loop.scenarios import Arguments, Scenario
+from mptc_gym import PRESETS, Parameters
+
+# Numbers that give words of the claims a meaning. They were chosen before any run, and are the
+# same for all claims.
+NOTABLE = 0.05  # a relative change of an error below this share is not "notable"
+MUCH = 0.2  # "much better", "seriously worse": the error differs by at least this share
+SOON = 150  # samples; the paper says that the weights converge within 150 sampling intervals
+
+LEVEL = 5.0  # degC, the constant set point, and the amplitude of the square wave
+SAMPLES = 1200  # length of a run, unless the case has another length
+LEARNING = 600  # samples after which a network counts as trained
+NOISY = PRESETS["noisy"]
+NOISY_SQUARE = "square wave, R = 0.5 °C²"
+# The cases of the set point. The constant set point comes first: without later changes, its
+# error comes from initial learning alone.
+SETPOINTS = PAPER_SETPOINTS[::-1]
+CONSTANT, SQUARE = (setpoint.arguments for setpoint in SETPOINTS)
+# Words for the learning rates ("gains") of a network with more nodes or inputs than the paper's
+# network, by the argument `in_proportion` of `Batch.networks`.
+WORDS_FOR_RATES = {False: "the same gains", True: "gains in proportion"}
+
+# The gains of a PI controller: kp, t/h per degC, and ki, t/h per degC and sample.
+PIGains = Mapping[str, float]
+PAPER_PI = {"kp": 2.2, "ki": 0.3}
+LOWER_PI = [{**PAPER_PI, "kp": float(kp)} for kp in np.linspace(0.1, PAPER_PI["kp"], 22)]
+DOUBLED_PI = {**PAPER_PI, "kp": 2 * PAPER_PI["kp"]}
+
+Findings = Iterable[Finding]
+
+
+def convergence(batch: Batch) -> Findings:
+    """Yield findings about the time after which the weights of the paper's network converge."""
+    for setpoint in SETPOINTS:
+        networks = batch.networks()
+        log = WeightLog(networks)
+        batch.run(networks, setpoint.samples, log, **setpoint.arguments)
+        times = converged_at(np.array(log.weights))  # samples; infinite if not converged
+        title = setpoint.title
+        yield judge_share(
+            f"weights converged within {SOON} samples, {title}", times <= SOON, often=True
+        )
+        yield from judge_times(f"time until the weights have converged, {title}", times)
+        yield judge_share(f"weights not converged when the run ends, {title}", np.isinf(times))
+
+
+def dead_zone(batch: Batch) -> Findings:
+    """Compare the errors of the paper's network at dead zones of 5 and 7 t/h (half widths)."""
+    for setpoint in SETPOINTS:
+        title = setpoint.title
+        narrow = batch.run_nn(setpoint.samples, **setpoint.arguments)
+        wide = batch.run_nn(setpoint.samples, **setpoint.arguments, dead_zone=7.0)
+        yield judge_share(
+            f"settled when the run ends, dead zone 7 t/h, {title}", settled(wide), often=True
+        )
+        yield judge(
+            f"mean error at dead zone 7 t/h, as a multiple of the error at 5, {title}",
+            mean_error(wide) / mean_error(narrow),
+            at_least=1 + MUCH,
+        )
+        yield judge(f"mean error, dead zone 5 t/h, {title}", mean_error(narrow), "°C")
+        yield judge(f"mean error, dead zone 7 t/h, {title}", mean_error(wide), "°C")
+
+
+def noise(batch: Batch) -> Findings:
+    """Compare the paper's network with an idle valve, on plants with noise.
+
+    At a constant set point, only the last 600 of 1,200 samples count, when learning is over.
+    """
+    idle_runs = batch.run_pi({"kp": 0.0, "ki": 0.0}, SAMPLES, setpoint=0.0, **NOISY)
+    idle_deviation = idle_runs[-600:].output.std(axis=0)
+    runs = batch.run_nn(SAMPLES, **CONSTANT, **NOISY)[-600:]
+    errors = runs.setpoint - runs.output
+    yield judge(
+        "absolute value of the average error over the last 600 of 1,200 samples, constant set "
+        "point",
+        np.abs(errors.mean(axis=0)),
+        "°C",
+        at_most=0.05 * LEVEL,
+    )
+    yield judge(
+        "standard deviation of y over the last 600 of 1,200 samples, as a multiple of the "
+        "deviation without control",
+        errors.std(axis=0) / idle_deviation,
+        at_most=1 + MUCH,
+    )
+    square_errors = mean_error(batch.run_nn(SAMPLES, **SQUARE, **NOISY))
+    is_better = square_errors < LEVEL  # the mean error without control
+    yield judge_share(
+        "mean error below the error without control, square wave", is_better, often=True
+    )
+    yield judge("mean error, square wave", square_errors, "°C")
+    yield judge("standard deviation of y without control", idle_deviation, "°C")
+
+
+def pi_gains(batch: Batch) -> Findings:
+    """Examine the paper's PI controller, and PI controllers with another gain Kp.
+
+    The claim is that the paper's controller oscillates, that a lower Kp is not notably better,
+    and that a higher Kp makes the loop unstable.
+    """
+    kp = PAPER_PI["kp"]
+    runs = batch.run_pi(PAPER_PI, SAMPLES, **CONSTANT)
+    yield judge(
+        f"peak to peak of y over the last 300 of 1,200 samples, Kp = {kp:g}, constant set "
+        "point",
+        np.ptp(runs.output[-300:]),
+        "°C",
+        at_least=2 * 0.05 * LEVEL,
+    )
+    cases = {"constant set point": CONSTANT, "square wave": SQUARE, NOISY_SQUARE: NOISY}
+    for title, arguments in cases.items():
+        yield best_lower_gain(batch, title, arguments)
+    runs = batch.run_pi(DOUBLED_PI, SAMPLES, **CONSTANT)
+    limited_share = 100 * np.mean(np.abs(runs.applied[-300:]) == Parameters().u_max)
+    yield judge(
+        f"samples of the last 300 with the flow at a limit, Kp = {2 * kp:g}",
+        limited_share,
+        "%",
+        at_least=50,
+    )
+    yield judge(
+        f"largest pole without dead zone and limits, Kp = {2 * kp:g}: unstable above 1",
+        largest_pole(DOUBLED_PI),
+        at_least=1,
+    )
+    quantity = "largest pole without dead zone and limits"
+    yield judge(f"{quantity}, Kp = {kp:g}", largest_pole(PAPER_PI))
+    smallest = min(largest_pole(gains) for gains in LOWER_PI)
+    yield judge(f"{quantity}, the best Kp of 0.1 to {kp:g}", smallest)
+
+
+def best_lower_gain(batch: Batch, title: str, arguments: Arguments) -> Finding:
+    """Compare the paper's PI controller with the best of those with a lower gain Kp.
+
+    `title` is the name of the case, and `arguments` are its arguments of the environment.
+    """
+    errors = [mean_error(batch.run_pi(gains, SAMPLES, **arguments)) for gains in LOWER_PI]
+    paper_errors = errors[-1]  # LOWER_PI ends with the paper's gains.
+    medians = [float(np.median(error)) for error in errors[:-1]]
+    best = int(np.argmin(medians))
+    return judge(
+        f"mean error with the best lower Kp ({LOWER_PI[best]['kp']:.1f}) as a multiple of "
+        f"the error with {PAPER_PI['kp']:g}, {title}",
+        (errors[best] / paper_errors).squeeze(),  # one exact number without noise
+        at_least=1 - NOTABLE,
+    )
+
+
+def largest_pole(gains: PIGains) -> float:
+    """Return the largest magnitude of a pole of the paper's plant with a PI controller.
+
+    The closed loop is taken without the actuator's dead zone and limits. The loop is stable if
+    the magnitude is below 1.
+    """
+    plant = linear.nominal(Parameters())
+    return linear.LinearLoop.of(PIController(gains["kp"], gains["ki"]), plant).largest_pole()
+
+
+def against_pi(batch: Batch, gains: PIGains) -> Findings:
+    """Compare the paper's network with a PI controller of these gains, in the same noise."""
+    for noise_title, noise_arguments in (("", {}), (", R = 0.5 °C²", NOISY)):
+        for setpoint in SETPOINTS:
+            arguments = {**setpoint.arguments, **noise_arguments}
+            nn_errors = mean_error(batch.run_nn(setpoint.samples, **arguments))
+            pi_errors = mean_error(batch.run_pi(gains, setpoint.samples, **arguments))
+            case = f"{setpoint.title}{noise_title}"
+            yield judge(
+                f"mean error of the NN as a multiple of the PI's, {case}",
+                nn_errors / pi_errors,
+                at_most=1 - MUCH,
+            )
+            yield judge_share(f"the NN is better, {case}", nn_errors < pi_errors)
+    nn_errors = mean_error(batch.run_nn(SAMPLES, dead_zone=7.0))
+    pi_errors = mean_error(batch.run_pi(gains, SAMPLES, dead_zone=7.0))
+    yield judge(
+        "mean error of the NN as a multiple of the PI's, square wave, dead zone 7 t/h",
+        nn_errors / pi_errors,
+    )
+
+
+def wrong_direction(batch: Batch) -> Findings:
+    """Measure when networks that assume the wrong sign of the plant's gain diverge.
+
+    A run counts as diverged when the temperature exceeds 90 % of the largest deviation that the
+    limited flow can cause.
+    """
+    runs = batch.run(batch.networks(direction=1), 600, **CONSTANT)
+    plant = Parameters()
+    largest_deviation = abs(linear.nominal(plant).gain) * plant.u_max  # degC
+    is_beyond = np.abs(runs.output) > 0.9 * largest_deviation
+    times = np.where(is_beyond.any(axis=0), np.argmax(is_beyond, axis=0), np.inf)
+    yield judge_share(
+        "temperature exceeds 90 % of the largest deviation that the flow can cause, in either "
+        f"direction, within {SOON} samples",
+        times <= SOON,
+        often=True,
+    )
+    yield judge_share(
+        "temperature exceeds this share when the run ends, after 600 samples",
+        is_beyond[-1],
+        often=True,
+    )
+    yield judge_share("temperature is on the wrong side when the run ends", runs.output[-1] < 0)
+    yield from judge_times("time until the temperature exceeds this share", times)
+
+
+def other_shapes(batch: Batch, shapes: Mapping[str, dict[str, int]]) -> Findings:
+    """Compare networks with more nodes or inputs with the paper's network.
+
+    `shapes` has the arguments `nodes` or `length` of `Batch.networks` by the title of a shape.
+    Each shape is examined with the paper's learning rates, and with rates scaled in proportion.
+    """
+    noisy_square = Scenario("noisy-square", NOISY_SQUARE, SAMPLES, NOISY)
+    for case in (*SETPOINTS, noisy_square):
+        paper_errors = mean_error(batch.run_nn(case.samples, **case.arguments))
+        for (title, shape), in_proportion in itertools.product(shapes.items(), (False, True)):
+            networks = batch.networks(**shape, in_proportion=in_proportion)
+            length = shape.get("length", PAPER_LENGTH)
+            windows: Arguments = {"setpoint_window": length, "error_window": length}
+            runs = batch.run(networks, case.samples, **case.arguments, **windows)
+            rates = WORDS_FOR_RATES[in_proportion]
+            yield judge(
+                f"mean error with {title}, {rates}, as a multiple of the error of the paper's "
+                f"network, {case.title}",
+                mean_error(runs) / paper_errors,
+                at_least=1 - NOTABLE,
+            )
+
+
+def reliability(batch: Batch) -> Findings:
+    """Compare networks of 3, 6 and 12 hidden nodes, before and after the failure of a node.
+
+    After `LEARNING` samples, the output of one hidden node stays at 0 or at 1 for ever.
+    """
+    for in_proportion, stuck_at in itertools.product((False, True), (0, 1)):
+        errors = {}  # after the failure, by the number of nodes
+        for nodes in (3, 6, 12):
+            networks = batch.networks(nodes=nodes, in_proportion=in_proportion)
+            damage = partial(damage_networks, networks, stuck_at)
+            runs = batch.run(networks, 2 * LEARNING, damage, **CONSTANT)
+            runs_before, runs_after = runs[:LEARNING], runs[LEARNING:]
+            errors[nodes] = mean_error(runs_after)
+            case = f"{nodes} nodes, one stuck at {stuck_at}, {WORDS_FOR_RATES[in_proportion]}"
+            if stuck_at == 0:  # Before the failure, the runs are the same for 0 and 1.
+                yield judge_share(f"settled before the failure, {case}", settled(runs_before))
+            yield judge_share(
+                f"settled 600 samples after the failure, {case}", settled(runs_after)
+            )
+            yield judge(
+                f"mean error in the 600 samples after the failure, {case}", errors[nodes], "°C"
+            )
+            if nodes > 3:
+                yield judge(
+                    f"this mean error as a multiple of the error with 3 nodes, {case}",
+                    errors[nodes] / errors[3],
+                    at_most=1 - NOTABLE,
+                )
+
+
+def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None:
+    """Damage the first hidden node of each network at the sample k = `LEARNING`.
+
+    A rollout calls this function before each sample. The output of the damaged node stays at
+    `stuck_at`, 0 or 1, and the other nodes go on learning.
+    """
+    if k != LEARNING:
+        return
+    weights = networks.weights
+    weights.W[..., 0, :] = 0.0
+    # So far out on the sigmoid the slope vanishes: the node cannot learn.
+    weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
+    networks.weights = weights
+
+
+def keep_learning(batch: Batch) -> Findings:
+    """Compare learning and frozen networks on plants that differ from the training plant.
+
+    The networks learn on the paper's plant. Then the gain or the delay of the plant changes,
+    and the weights either continue to learn or stay as they are.
+    """
+    networks = batch.networks()
+    batch.run(networks, SAMPLES, **SQUARE)
+    learnt_weights = networks.weights
+    changes: dict[str, Arguments] = {
+        "gain times 0.75": {"gain_factor": 0.75},
+        "gain times 1.25": {"gain_factor": 1.25},
+        "gain times 1.4": {"gain_factor": 1.4},
+        "delay 27": {"delay": 27},
+        "gain times 1.25 and delay 27": {"gain_factor": 1.25, "delay": 27},
+        "no change": {},
+    }
+    for title, plant in changes.items():
+        networks.weights = learnt_weights
+        networks.learning = True
+        learning_errors = mean_error(batch.run(networks, SAMPLES, **SQUARE, **plant))
+        networks.weights = learnt_weights
+        networks.learning = False
+        frozen_errors = mean_error(batch.run(networks, SAMPLES, **SQUARE, **plant))
+        yield judge(
+            f"mean error of learning weights divided by that of frozen weights, {title}",
+            learning_errors / frozen_errors,
+            at_most=1 - NOTABLE if plant else math.inf,  # "no change" is information only
+        )
+        yield judge(f"mean error of frozen weights, {title}", frozen_errors, "°C")
+        is_useless = frozen_errors >= LEVEL  # the mean error without control
+        yield judge_share(f"frozen weights do no better than no control, {title}", is_useless)
+
+
+def direction_only(batch: Batch) -> Findings:
+    """Measure how often the paper's network settles on plants with other dynamics.
+
+    The plants differ from the paper's plant in delay, gain and time constant. The steady flow
+    for a set point of 5 degC lies beyond the actuator's limits if the gain is below 0.74 of the
+    paper's gain, and inside the dead zone if the gain is above 1.46 of the paper's gain. So
+    there are two series of runs: with a set point of 5 degC, and with a set point of 5 degC
+    times the gain factor.
+    """
+    fixed = plants_that_settle(batch, gains=(0.75, 1.0, 1.25, 1.4), is_scaled=False)
+    scaled = plants_that_settle(batch, gains=(0.7, 1.0, 1.25, 1.5), is_scaled=True)
+    series = {"set point 5 °C": fixed, "set point 5 °C times the gain": scaled}
+
+    delays = fixed.query("constant == 1 and gain == 1")
+    yield judge_worst(delays, "delays from 9 to 36, set point 5 °C")
+    constants = fixed.query("gain == 1 and delay == 18")
+    text = "time constants from 0.5 to 2 times the paper's, set point 5 °C"
+    yield judge_worst(constants, text)
+    for setpoint, plants in series.items():
+        lowest, highest = plants["gain"].min(), plants["gain"].max()
+        text = f"gains from {lowest:g} to {highest:g} times the paper's, {setpoint}"
+        yield judge_worst(plants.query("constant == 1 and delay == 18"), text)
+    for setpoint, plants in series.items():
+        yield judge_worst(plants, f"all {len(plants)} combinations, {setpoint}")
+        yield judge(
+            f"combinations in which at least {OFTEN:.0%} of runs settle, {setpoint}",
+            100 * (plants["share"] >= OFTEN).mean(),
+            "%",
+        )
+
+
+def plants_that_settle(
+    batch: Batch, gains: Iterable[float], *, is_scaled: bool
+) -> pd.DataFrame:
+    """Run the paper's network on plants with other dynamics, and return a row for each plant.
+
+    The plants are all combinations of three time constants, four delays and these gains.
+
+    Parameters
+    ----------
+    batch
+        Number and seeds of the runs on each plant.
+    gains
+        Gains of the plants, as multiples of the paper's gain.
+    is_scaled
+        Whether the set point is 5 degC times the gain factor, in place of 5 degC.
+
+    Returns
+    -------
+    DataFrame
+        The columns are `constant` and `gain`, factors of the paper's time constant and gain;
+        `delay`, samples; `runs`, an array of shape (runs,) that says whether each run settles;
+        and `share`, the share of runs that settle.
+    """
+    rows = []
+    for constant, gain, delay in itertools.product((0.5, 1.0, 2.0), gains, (9, 18, 27, 36)):
+        plant = {"gain_factor": gain, "time_constant_factor": constant, "delay": delay}
+        setpoint = LEVEL * gain if is_scaled else LEVEL
+        settles = settled(batch.run_nn(SAMPLES, setpoint=setpoint, **plant))
+        row = {"constant": constant, "gain": gain, "delay": delay}
+        rows.append({**row, "runs": settles, "share": settles.mean()})
+    return pd.DataFrame(rows)
+
+
+def judge_worst(plants: pd.DataFrame, text: str) -> Finding:
+    """Return a finding about the plant on which the smallest share of runs settles.
+
+    `plants` are rows of what `plants_that_settle` returns, and `text` describes these plants in
+    words.
+    """
+    worst = plants.iloc[plants["share"].argmin()]
+    quantity = (
+        f"settled within 1,200 samples, the worst of {text} (delay {worst['delay']}, gain "
+        f"{worst['gain']:g}, time constant {worst['constant']:g})"
+    )
+    return judge_share(quantity, worst["runs"], often=True)
