@@ -4,7 +4,7 @@ import re
 import sys
 from pathlib import Path
 
-from benchmarks.lib.command import finish
+from benchmarks.lib.command import run_program
 
 FOLDER = Path(__file__).parent
 
@@ -35,4 +35,4 @@ def questions() -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(finish(questions, "python -m benchmarks"))
+    sys.exit(run_program("python -m benchmarks", questions))

@@ -67,7 +67,7 @@ REFUSED = {
         (["--set", "render_mode=human"], "--set: render_mode is not an argument of the plant"),
         (["--agent", "PI=agents:PIController"], "'PI' is taken"),
         (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
-        (["--out", ""], "--out: must name a folder"),
+        (["--out", ""], "--out: . must not be the current folder"),
         (["--out", "/proc/here"], "cannot be written to: "),
     ],
     "datasets": [(["middlepoint/paper/ppo-v0"], 'Choose from: "middle')],
@@ -177,7 +177,7 @@ import pathlib, signal, sys, time
 from dataclasses import dataclass, field
 from functools import partial
 from benchmarks.lib.command import command, options
-from benchmarks.lib.command import FanOut
+from benchmarks.lib.parallel import FanOut
 from benchmarks.lib.storage import write_text
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # however this was started
@@ -190,7 +190,8 @@ class Options:
 def work(options):
     try:
         print("up", flush=True)
-        dict(options.fan_out.stream({name: partial(time.sleep, 60) for name in "abcd"}))
+        tasks = {name: partial(time.sleep, 60) for name in "abcd"}
+        dict(options.fan_out.stream(tasks, "tasks"))
     finally:
         print("writes", flush=True)
         time.sleep(2)

@@ -21,8 +21,9 @@ from agents.controller import PAPER_WINDOWS
 from agents.networks import WINDOWS
 from benchmarks.controllers.roster import OWN_LOOKS, RENAMED, ROSTER
 from benchmarks.controllers.spec import EVERYTHING, LIMITS, ControllerSpec
-from benchmarks.lib.command import FanOut, Names, Parameter, blame, known, options
+from benchmarks.lib.command import Names, Parameter, blame, known, options
 from benchmarks.lib.errors import UsageError
+from benchmarks.lib.parallel import FanOut
 from mptc_gym import IDS, Parameters
 from mptc_gym.environments.layers import plant_groups
 from mptc_gym.evaluation import case_of

@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from benchmarks.lib.command import Count, FanOut, Folder, Parameter, command, options
+from benchmarks.lib.command import Count, Folder, Parameter, command, options
 from benchmarks.lib.errors import UsageError
+from benchmarks.lib.parallel import FanOut
 from benchmarks.lib.results import KeptResults, conditions_of, results_folder
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.scenarios import PlantOptions
