@@ -53,7 +53,7 @@ REFUSED = {
     "compare": [
         (["--agents", "nn", "pie"], "--agents: there is no 'pie'; choose from idle, nn, "),
         (["--agents", "nothing"], "--agents: 'nothing' is now called 'idle'"),
-        (["--agent", "mine=none.json"], "must be .* of a module or a file that exists"),
+        (["--agent", "mine=none.json"], "needs the file .none.json., which does not exist"),
         (["--agents"], "name at least one controller"),
         (["--scenarios", "circle"], "no 'circle'"),
         (["--scenarios"], "--scenarios: name at least one case"),
@@ -67,6 +67,9 @@ REFUSED = {
         (["--set", "render_mode=human"], "--set: render_mode is not an argument of the plant"),
         (["--agent", "PI=agents:PIController"], "'PI' is taken"),
         (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
+        (["--agent", "mine=my_controllers.py:PI"], r"\(MODULE without \.py\)"),
+        (["--agent", "mine=my_controllers:PI"], "needs the module .my_controllers., which is"),
+        (["--agent", "mine=PPO:none.zip"], "needs the file .none.zip., which does not exist"),
         (["--out", ""], "--out: . must not be the current folder"),
         (["--out", "/proc/here"], "cannot be written to: "),
     ],
@@ -92,7 +95,7 @@ REFUSED = {
         (["pi"], '"pi" for NETWORK. Choose from: "neural", "ppo"'),
     ],
     "watch": [
-        (["--agent", "pi=none"], "--agent: .pi=none. must be .*; .pi. is taken"),
+        (["--agent", "pi=none"], "--agent: .pi=none. must have the form NEW_NAME=MODULE"),
         (["--agent", "nn-smith"], "--agent: 'nn-smith' is now called 'neural-smith'"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
         (["--scenario", "triangle"], "--scenario.*constant-noise"),

@@ -72,6 +72,21 @@ def test_an_exception_names_its_task_and_spares_the_others(jobs):
     assert done == {f"plant {seed}": draw(seed) for seed in range(4)}
 
 
+def refuse():
+    raise UsageError("--agent: a controller cannot be run: no reason\n\nTraceback of the user")
+
+
+def test_an_error_of_the_user_is_listed_by_its_first_line():
+    with pytest.raises(UnfinishedError) as error:
+        run({"mine, square": refuse, "mine, constant": refuse}, jobs=1)
+    lines = str(error.value).splitlines()
+    assert lines[1:3] == [
+        "mine, square: --agent: a controller cannot be run: no reason",
+        "mine, constant: --agent: a controller cannot be run: no reason",
+    ]
+    assert lines[-1] == "Traceback of the user"
+
+
 def test_a_killed_process_is_a_sentence():
     with pytest.raises(
         UnfinishedError, match="killed, perhaps because memory ran out: try fewer"

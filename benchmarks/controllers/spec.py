@@ -314,9 +314,6 @@ class ControllerSpec:
         """
         agent = controller or self.make(plant, runs, seed)
         arguments = {**plant, **self.observation}
-        if hasattr(agent, "opened"):  # A user's policy acts in an environment of its own.
-            with agent.opened(samples, **arguments) as plants:
-                return rollout(plants, agent, samples, seed)
         return rollout(make_plants(runs, samples, **arguments), agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:

@@ -63,7 +63,9 @@ def stop(program: str, error: UsageError | ImportError) -> NoReturn:
     """
     message = str(error)
     cause = error.__cause__ or error
-    package = str(getattr(cause, "name", "")).partition(".")[0]
+    package = ""
+    if isinstance(cause, ImportError):
+        package = str(cause.name).partition(".")[0]
     if package in EXTRAS:
         extra = EXTRAS[package]
         message = f'{package} is not installed: pip install -e ".[{extra}]" ({cause})'
