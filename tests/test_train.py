@@ -33,7 +33,10 @@ from tests.conftest import ROOT
 SMALL = Training(steps=2, plants=4, segment=60, nodes=3, hidden=2, validation_episodes=2)
 RECIPE = replace(
     ppo.RECIPES["ppo"],
-    plants=((8, {"setpoint": "random"}), (16, {"setpoint": "random", "noise_variance": 0.5})),
+    plants=(
+        ppo.TrainingPlants(8, {"setpoint": "random"}),
+        ppo.TrainingPlants(16, {"setpoint": "random", "noise_variance": 0.5}),
+    ),
     cases={"short": {"max_episode_steps": 20}},
     hidden=(8,),
     memory=40,
@@ -121,7 +124,10 @@ def test_the_command_lists_trainings_by_their_seeds(
     network, steps, files, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setitem(neural.RECIPES, "neural", SMALL)
-    short = {"plants": ((64, {}),), "cases": {"short": {"max_episode_steps": 20}}}
+    short = {
+        "plants": (ppo.TrainingPlants(64, {}),),
+        "cases": {"short": {"max_episode_steps": 20}},
+    }
     monkeypatch.setitem(ppo.RECIPES, "ppo", replace(ppo.RECIPES["ppo"], **short))
     arguments = [network, "--networks", "2", "--steps", str(steps), "--jobs", "1"]
     assert program.main([*arguments, "--out", str(tmp_path)]) == 0
@@ -250,7 +256,7 @@ class TestOtherPlants:
         assert ppo.for_plant({}).plants == ppo.RECIPES["ppo"].plants
 
     def test_what_is_trained_is_run_by_compare_on_this_plant(self, tmp_path, monkeypatch):
-        short = replace(ppo.RECIPES["ppo"], plants=((8, {}), (8, {})))
+        short = replace(ppo.RECIPES["ppo"], plants=(ppo.TrainingPlants(8, {}),) * 2)
         monkeypatch.setitem(ppo.RECIPES, "ppo", short)
         given = "ppo --networks 2 --steps 8 --jobs 1 --set b=[0.0456,0.00404] --set u_max=12"
         assert program.main([*given.split(), "--out", str(tmp_path)]) == 0

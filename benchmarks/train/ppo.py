@@ -9,7 +9,7 @@ observations with a longer past, and the validation of trained policies.
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
@@ -41,12 +41,18 @@ TRAINING_SEEDS = SEEDS["training"].first  # least seed of the training plants
 MAX_MOVE = 2.0
 
 
+class TrainingPlants(NamedTuple):
+    """Training plants of one kind."""
+
+    number: int  # number of plants
+    arguments: Mapping[str, Any]  # their arguments of the environment
+
+
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
     """The settings of a training of a policy by PPO."""
 
-    # Kinds of training plants: the number of plants, and their arguments of the environment.
-    plants: tuple[tuple[int, Mapping[str, Any]], ...]
+    plants: tuple[TrainingPlants, ...]  # the kinds of training plants
     # Arguments of the environment for each case of the validation, by name. No published result
     # uses these cases.
     cases: Mapping[str, Mapping[str, Any]]
@@ -66,27 +72,33 @@ class Recipe:
     @property
     def windows(self) -> dict[str, Any]:
         """The arguments of the environment that determine the policy's observation."""
-        past = {"output_window": self.memory, "action_window": self.memory}
-        return {"setpoint_window": 3, "error_window": 1, **past}
+        return {
+            "setpoint_window": 3,
+            "error_window": 1,
+            "output_window": self.memory,
+            "action_window": self.memory,
+        }
 
     @property
     def temperature_scale(self) -> float:
         """The amplitude of the set points, as a multiple of the paper's amplitude."""
-        _, arguments = self.plants[0]
-        scale: float = arguments.get("error_scale", _ERROR_SCALE) / _ERROR_SCALE
-        return scale
+        error_scale: float = self.plants[0].arguments.get("error_scale", ERROR_SCALE)
+        return error_scale / ERROR_SCALE
 
 
 # The error, degC, at which the reward is -1. With this scale, returns are of order 1, so that
 # the value function is learnt quickly.
-_ERROR_SCALE = 50.0
-_COST = {"reward": "absolute", "error_scale": _ERROR_SCALE}
+ERROR_SCALE = 50.0
+_COST = {"reward": "absolute", "error_scale": ERROR_SCALE}
 _RANDOM = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
 _SLOWER = {"setpoint_amplitude": 5.4, "setpoint_period": 500}
 
 RECIPES = {
     "ppo": Recipe(
-        plants=((152, _RANDOM), (360, {**_RANDOM, "noise_variance": 0.6})),
+        plants=(
+            TrainingPlants(152, _RANDOM),
+            TrainingPlants(360, {**_RANDOM, "noise_variance": 0.6}),
+        ),
         cases={"calm": _SLOWER, "noise": {**_SLOWER, "noise_variance": 0.4}},
         dead_zone=5.0,
         levels=False,
@@ -96,7 +108,7 @@ RECIPES = {
         log_std=(-1.2, -4.0),
     ),
     "ppo-hard": Recipe(
-        plants=((512, {**PRESETS["hard"], **_COST, "setpoint_amplitude": 5.5}),),
+        plants=(TrainingPlants(512, {**PRESETS["hard"], **_COST, "setpoint_amplitude": 5.5}),),
         cases={"hard": {**PRESETS["hard"], "setpoint_amplitude": 5.5, "setpoint_period": 560}},
         dead_zone=0.0,
         levels=True,
@@ -119,29 +131,34 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
     plant
         Arguments of the environment for the plant.
     """
-    parameters, paper = Parameters(**plant), Parameters()
+    parameters = Parameters(**plant)
+    paper = Parameters()
     amplitude = parameters.setpoint_amplitude / paper.setpoint_amplitude
     training = {
         **plant,
         "reward": "absolute",
-        "error_scale": _ERROR_SCALE * amplitude,
+        "error_scale": ERROR_SCALE * amplitude,
         "setpoint": "random",
         "setpoint_amplitude": 6.0 * amplitude,
     }
     noisy = dict(training)
     if parameters.range_of("noise_variance")[1] == 0.0:
         reach = "reach of half the flow's range, °C"
-        noisy["noise_variance"] = 0.6 * (scales(parameters)[reach] / scales(paper)[reach]) ** 2
+        ratio = scales(parameters)[reach] / scales(paper)[reach]
+        noisy["noise_variance"] = 0.6 * ratio**2
     validation = {
         **plant,
         "setpoint": "square",
         "setpoint_amplitude": 5.4 * amplitude,
         "setpoint_period": max(2, 2 * round(parameters.setpoint_period * 500 / 1200)),
     }
-    (calm, _), (rest, _) = RECIPES["ppo"].plants
+    calm_kind, noisy_kind = RECIPES["ppo"].plants
     return replace(
         RECIPES["ppo"],
-        plants=((calm, training), (rest, noisy)),
+        plants=(
+            TrainingPlants(calm_kind.number, training),
+            TrainingPlants(noisy_kind.number, noisy),
+        ),
         cases={"plant": validation},
         dead_zone=sum(parameters.range_of("dead_zone")) / 2.0,
     )
@@ -162,17 +179,18 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
         Arguments of the environment for the plant that the recipe was made for by `for_plant`;
         None for one of `RECIPES`.
     """
-    began, model = time.process_time(), begin(recipe, seed)
+    began = time.process_time()
+    model = begin(recipe, seed)
     model.learn(recipe.steps, callback=Exploration(*recipe.log_std))
     seconds = time.process_time() - began
     policy = export(model, recipe)
     if plant is not None:
         parameters = Parameters(**plant)
         policy = replace(policy, **knowledge(LIMITS, parameters, 1, seed))
-    validation = {
-        name: evaluate(policy, seed=VALIDATION_SEED, **recipe.windows, **case).mean_error
-        for name, case in recipe.cases.items()
-    }
+    validation = {}  # mean errors, degC
+    for name, case in recipe.cases.items():
+        result = evaluate(policy, seed=VALIDATION_SEED, **recipe.windows, **case)
+        validation[name] = result.mean_error
     policy.provenance = {
         "algorithm": "PPO of Stable-Baselines3",
         "recipe": asdict(recipe) | SETTINGS,
@@ -211,13 +229,21 @@ class Plants(GymnasiumVecEnv):
     """
 
     def __init__(self, recipe: Recipe) -> None:
-        moves = {"max_move": MAX_MOVE, "compensate_dead_zone": recipe.dead_zone}
-        same = {**recipe.windows, "autoreset_mode": "SameStep"}
-        batches = (
-            gymnasium.make_vec("MiddlePoint-v0", number, **same, **arguments)
-            for number, arguments in recipe.plants
-        )
-        super().__init__(*(IncrementalAction(each, **moves) for each in batches), group=GROUP)
+        batches = []
+        for plants in recipe.plants:
+            batch = gymnasium.make_vec(
+                "MiddlePoint-v0",
+                plants.number,
+                autoreset_mode="SameStep",
+                **recipe.windows,
+                **plants.arguments,
+            )
+            batches.append(
+                IncrementalAction(
+                    batch, max_move=MAX_MOVE, compensate_dead_zone=recipe.dead_zone
+                )
+            )
+        super().__init__(*batches, group=GROUP)
         self._features = features(recipe).T.astype(np.float32)
         self.observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
 
@@ -226,8 +252,8 @@ class Plants(GymnasiumVecEnv):
 
         The seeds follow from `seed`, and no comparison of controllers uses them.
         """
-        (first,) = np.random.SeedSequence(seed).generate_state(1).tolist()
-        return super().seed(TRAINING_SEEDS + first)
+        offset = int(np.random.SeedSequence(seed).generate_state(1)[0])  # below 2**32
+        return super().seed(TRAINING_SEEDS + offset)
 
     def reset(self) -> NDArray[Any]:
         """Reset all plants, and return their observations, shape (plants, inputs)."""
@@ -241,7 +267,8 @@ class Plants(GymnasiumVecEnv):
         """
         observations, rewards, ended, infos = super().step_wait()
         for i in np.flatnonzero(ended).tolist():
-            infos[i]["terminal_observation"] = infos[i]["terminal_observation"] @ self._features
+            last_observation = infos[i]["terminal_observation"]
+            infos[i]["terminal_observation"] = last_observation @ self._features
         return cast("Array", observations) @ self._features, rewards, ended, infos
 
 
@@ -251,12 +278,15 @@ def features(recipe: Recipe) -> Array:
     The shape is (inputs, size of the observation). The inputs are the error and the changes of
     set point, temperature and flow and, with `recipe.levels`, the set point and the flow.
     """
-    one = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
-    one[: -recipe.memory] /= recipe.temperature_scale  # all but the flows are temperatures
-    seen = inputs(one, recipe.windows)
-    if recipe.levels:  # the set point and the flow
-        seen = torch.hstack([seen, 0.2 * one[:, :1], one[:, -recipe.memory, None]])
-    return cast("Array", seen.numpy().T)
+    # As `inputs` is linear, its values for the rows of an identity matrix are the matrix.
+    identity = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
+    identity[: -recipe.memory] /= recipe.temperature_scale  # all but the flows are temperatures
+    columns = inputs(identity, recipe.windows)
+    if recipe.levels:
+        setpoint = 0.2 * identity[:, :1]
+        flow = identity[:, -recipe.memory, None]
+        columns = torch.hstack([columns, setpoint, flow])
+    return cast("Array", columns.numpy().T)
 
 
 def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
@@ -265,14 +295,15 @@ def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
     The conversion of observations to inputs becomes part of the first layer. `model` was
     trained with `recipe`.
     """
-    layers = [
-        (layer.weight.detach().double().numpy(), layer.bias.double().numpy())
-        for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net)
-        if isinstance(layer, nn.Linear)
-    ]
-    (weights, bias), *others = layers
+    layers = []
+    for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net):
+        if isinstance(layer, nn.Linear):  # The other layers are activation functions.
+            weights = layer.weight.detach().double().numpy()
+            layers.append((weights, layer.bias.detach().double().numpy()))
+    first_weights, first_biases = layers[0]
+    layers[0] = (first_weights @ features(recipe), first_biases)
     return PolicyNetwork(
-        [(weights @ features(recipe), bias), *others],
+        layers,
         observation=recipe.windows,
         input_scale=np.ones(sum(recipe.windows.values())),
         activation="tanh",
