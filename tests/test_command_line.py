@@ -14,11 +14,16 @@ import pytest
 
 pytest.importorskip("cyclopts", reason="the commands need the extra compare")
 
-from benchmarks.__main__ import commands
 from benchmarks.lib.command import read
 from tests.conftest import ROOT, python
 
-COMMANDS = commands()
+# The modules of the commands `python -m benchmarks.NAME`, by NAME.
+COMMANDS = {
+    path.stem: f"benchmarks.{path.stem}"
+    for path in sorted((ROOT / "benchmarks").glob("[a-z]*.py"))
+}
+for path in (ROOT / "benchmarks").glob("*/__main__.py"):
+    COMMANDS[path.parent.name] = f"benchmarks.{path.parent.name}.__main__"
 HEAVY = {
     "joblib", "matplotlib", "optuna", "pandas", "pygame", "ray", "scipy", "stable_baselines3",
     "torch",
