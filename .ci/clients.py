@@ -56,6 +56,7 @@ def torchrl() -> None:
         "MiddlePoint-v0", num_envs=4, max_episode_steps=20, autoreset_mode="Disabled"
     )
     rollout = GymWrapper(plants).rollout(60, break_when_any_done=False)
+    # Each of the 4 plants ends an episode of 20 steps three times.
     assert rollout["next", "truncated"].sum(1).flatten().tolist() == [3] * 4
 
 
@@ -173,6 +174,7 @@ def rllib() -> None:
     assert algorithm.train()["num_env_steps_sampled_lifetime"] == 1000
 
     names = {"algorithm": algorithm, "torch": torch}
+    # The policy returns means and then standard deviations of actions. The mean is the action.
     act = eval(f"lambda observations: {policy}[:, :1].detach().numpy()", names)
     assert mptc_gym.evaluate(act, episodes=2, action_window=20).mean_error < 100.0
     algorithm.stop()

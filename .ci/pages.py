@@ -60,6 +60,7 @@ def on_page_content(html: str, **_: object) -> str:
     html = html.replace("<p>::</p>\n", "")  # before literal blocks in docstrings
     # The environment's docstring gets the table of its arguments when it is imported.
     html = html.replace("<p><arguments></p>", ARGUMENTS)
+    # A value has groups of digits, as in 5_000_000.
     html = CONSTANT.sub(lambda name: f"{getattr(evaluation, name[1]):_}", html)
     html = html.replace('href="README.md"', 'href="../"')  # in the notebook
     # On a small screen, a click shows the picture in full size.

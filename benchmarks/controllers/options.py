@@ -57,7 +57,7 @@ def agent_names(option: str, names: Sequence[str]) -> list[str]:
     Raises
     ------
     UsageError
-        If a name is not that of a controller in `ROSTER`. For a name of an earlier version, the
+        If no controller in `ROSTER` has one of the names. For a name of an earlier version, the
         message has the present name.
     """
     for name in names:
@@ -142,7 +142,8 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
         If a JSON or NPZ file cannot be read, or if the kinds of locations cannot be combined.
     """
     suffixes = {Path(location).suffix for location in locations}
-    if len(locations) > 1 and (".json" in suffixes or {".npz"} < suffixes):
+    has_file = ".json" in suffixes or ".npz" in suffixes
+    if len(locations) > 1 and has_file and suffixes != {".npz"}:
         listed = " and ".join(locations)
         raise UsageError(
             f"--agent: {name!r} must be one gains.json or several .npz, got {listed}"

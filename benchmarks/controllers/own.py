@@ -183,6 +183,7 @@ def _factory_of_zip(location: str) -> Factory:
     def factory() -> Any:
         return model
 
+    # Texts for the report, as a user's factory can have them.
     weights = sum(weight.numel() for weight in model.policy.parameters())
     samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
     factory.searched = f"{weights:,} weights: {samples}"  # type: ignore[attr-defined]

@@ -1,9 +1,9 @@
 """Make the command `python -m benchmarks.NAME` from a dataclass of options and a function.
 
-The module of a command defines a dataclass `Options`, whose docstrings are the text of
-`--help`, and a function `work`, which takes an instance of `Options`, writes the results and
-returns the last line to print. The function `work` itself imports the packages that are slow to
-import, so that `--help` is quick. The line `main = command("NAME", Options, work)` makes the
+The module of a command defines a dataclass `Options` and a function `work`. The docstrings of
+`Options` are the text of `--help`. The function `work` takes an instance of `Options`, writes
+the results and returns the last line to print. It imports packages that are slow to import
+itself, so that `--help` is quick. The line `main = command("NAME", Options, work)` makes the
 command.
 """
 
@@ -234,8 +234,8 @@ def run_program(program: str, work: Callable[[], str]) -> int:
 def _interrupt_on_signals() -> None:
     """Make the first Ctrl-C or SIGTERM raise a KeyboardInterrupt in this process.
 
-    A signal that this process ignored when it was started stays ignored: a shell starts
-    commands in the background so.
+    A signal that this process has ignored since its start stays ignored: so a shell protects a
+    command in the background from the user's Ctrl-C.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:

@@ -24,12 +24,11 @@ LISTED_FAILURES = 20  # largest number of failed tasks that a message lists
 
 
 class Outcome(NamedTuple):
-    """What has become of a task."""
+    """The outcome of a task that has ended."""
 
     task: str  # the name of the task
-    result: Any = None  # what the task returned; None if the task failed
-    reason: str = ""  # one line that says why the task failed; "" after success
-    details: str = ""  # all lines of the error message or of the traceback; "" after success
+    result: Any  # what the task returned; None if the task failed
+    error: str  # why the task failed: a first line, and perhaps a traceback; "" after success
 
 
 @options
@@ -81,7 +80,7 @@ class FanOut:
                     yield name, result
             for outcome in self._outcomes(missing):
                 advance()
-                if outcome.reason:
+                if outcome.error:
                     failures.append(outcome)
                     continue
                 if store:
@@ -130,28 +129,29 @@ class FanOut:
 def _attempt(name: str, task: Task) -> Outcome:
     """Run the task called `name`, in any process, and return the outcome of the task.
 
-    The outcome of a task that fails has the error as text, since some exceptions cannot be
-    pickled.
+    If the task raises an error, the outcome has the error as text, since some exceptions cannot
+    be pickled.
     """
     try:
-        return Outcome(name, task())
+        return Outcome(name, task(), "")
     except UsageError as error:
-        message = str(error)
-        return Outcome(name, reason=message.splitlines()[0], details=message)
-    except (Exception, SystemExit):
-        lines = traceback.format_exc().strip()
-        return Outcome(name, reason=lines.splitlines()[-1], details=lines)
+        return Outcome(name, None, str(error))
+    except (Exception, SystemExit) as error:
+        reason = f"{type(error).__name__}: {error}"
+        return Outcome(name, None, f"{reason}\n\n{traceback.format_exc()}")
 
 
 def _summary(failures: Sequence[Outcome], tasks: int) -> str:
-    """Return a message about failed tasks: the reasons of all, and the details of the first.
+    """Return a message with the first line of each task's error, and all of the first error.
 
     `failures` are the outcomes of the failed tasks, and `tasks` is the number of all tasks,
     also of those that succeeded.
     """
-    first_line = f"{len(failures)} of {tasks} tasks failed; the other tasks have finished"
-    reasons = [f"{failure.task}: {failure.reason}" for failure in failures[:LISTED_FAILURES]]
-    return "\n".join([first_line, *reasons, failures[0].details])
+    lines = [f"{len(failures)} of {tasks} tasks failed; the other tasks have finished"]
+    for failure in failures[:LISTED_FAILURES]:
+        first_line, _, _ = failure.error.partition("\n")
+        lines.append(f"{failure.task}: {first_line}")
+    return "\n".join([*lines, "", failures[0].error])
 
 
 def _prepare_worker(parent: int) -> None:

@@ -56,7 +56,7 @@ def commit() -> str:
     If files of the checkout differ from the commit, "-dirty" follows the hash. If git is not
     installed or the checkout is not a git repository, the result is "".
     """
-    if not (ROOT / ".git").exists():  # git would look for a repository around it.
+    if not (ROOT / ".git").exists():  # git would look around the checkout.
         return ""
     command = ["git", "status", "--porcelain=v2", "--branch"]
     try:

@@ -79,10 +79,10 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
 
 
 def _lock(final: Path) -> AbstractContextManager[object]:
-    """Return a lock on the folder `final`, which the end of a `with` block releases.
+    """Lock the folder `final`, and return a context whose end unlocks the folder.
 
     The folder need not exist: the lock is a hidden file beside the folder. The operating system
-    releases the lock if this process is killed.
+    unlocks the folder if this process is killed.
 
     Raises
     ------

@@ -86,7 +86,7 @@ class Net(nn.Module):
         self.state = torch.zeros(n, self.cell.hidden_size)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the corrections of the control law at a sample, and update the state.
+        """Return the corrections of the control law at a sample, and update `state`.
 
         `inputs` are those of `agents.law`, shape (n, INPUTS), and the corrections have the
         shape (n, OUTPUTS).
@@ -138,7 +138,8 @@ class Loops:
         self._net = net
         self._authorities = batch.authorities
         self._bank = Bank(batch.prior)
-        largest_flow = np.ones_like(batch.edges)  # as a share of half the actuator's range
+        # Flows are shares of half the actuator's range, so the limits are -1 and 1.
+        largest_flow = np.ones_like(batch.edges)
         limits = -largest_flow, largest_flow
         self._observer = Observer(self._bank, batch.edges, limits, batch.random_setpoint)
         self._law = Law(self._bank, batch.edges, limits, torch, torch.from_numpy)
@@ -300,14 +301,15 @@ def expected_error(
     chances = chance_of_change(batch.ages.gather(0, decisions), delays + 1.0)
     chances = chances * batch.changes_by_surprise
     errors = (1.0 - chances) * if_kept + chances * if_changed
+    # At the start of an episode, no command may affect any output yet.
     return (errors * is_affected).sum() / is_affected.sum().clamp(min=1)
 
 
 def validate(network: RecurrentNetwork, episodes: int) -> dict[str, float]:
-    """Return the mean error, degC, and the valve travel, t/h, of a network by name.
+    """Return the results of a network's validation: "mean_error", degC, and "travel", t/h.
 
     The network corrects the self-tuning controller on `episodes` validation episodes of the
-    environment `MiddlePointHard-v0`.
+    environment `MiddlePointHard-v0`. The travel is that of the valve.
     """
     plant = Parameters(**PRESETS["hard"])
     known = knowledge(BANK, plant, episodes, VALIDATION_SEED)

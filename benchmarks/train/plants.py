@@ -137,9 +137,10 @@ class Sampler:
 
     def batch(self) -> Batch:
         """Return a new random batch of n plants for an episode."""
-        shares = self._uniform(0.0, 1.0)
-        is_hard = shares < self._hard_share
-        is_exact = shares > (1.0 + self._hard_share) / 2.0
+        # One random number decides of which of three kinds a plant is.
+        kinds = self._uniform(0.0, 1.0)
+        is_hard = kinds < self._hard_share
+        is_exact = kinds > (1.0 + self._hard_share) / 2.0
         numbers = self._plant_numbers(is_hard)
         amplitudes = self._amplitudes(numbers["gain_factor"], is_hard)
         setpoints, ages = self._setpoints(amplitudes, is_hard)
@@ -185,10 +186,11 @@ class Sampler:
         return self._uniform(0.0, 1.0) < share
 
     def _plant_numbers(self, is_hard: Tensor) -> dict[str, Tensor]:
-        """Return random plant numbers by the names of the environment's arguments.
+        """Return random delays, gains and other numbers of the plants, each of shape (n,).
 
-        `is_hard` says which plants are like those of the preset `hard`, shape (n,). The numbers
-        of the other plants come from wider ranges. Each array of numbers has the shape (n,).
+        The keys are the names of the environment's arguments. `is_hard` says which plants are
+        like those of the preset `hard`, shape (n,). Plants unlike `hard` have numbers from wider
+        ranges.
         """
         is_noisy = self._true_for(0.65)
         has_load = self._true_for(0.5)
@@ -257,14 +259,14 @@ class Sampler:
         # The number of levels that have started at each sample of each plant, shape
         # (n, SAMPLES + 1): `searchsorted` needs one sorted row for each plant.
         started = torch.searchsorted(starts.T.contiguous(), samples_of_plants, right=True)
-        present_level = started.T - 1
-        ages = samples[:, None] - starts.gather(0, present_level)
-        return levels.gather(0, present_level), ages
+        level_numbers = started.T - 1
+        ages = samples[:, None] - starts.gather(0, level_numbers)
+        return levels.gather(0, level_numbers), ages
 
     def _step_test(
         self, factors: Tensor, spread: float, is_hard: Tensor, is_exact: Tensor
     ) -> Tensor:
-        """Return the gain or the time constant that the step test of each plant finds.
+        """Return the gains or the time constants that the step tests of the plants find.
 
         Parameters
         ----------
@@ -276,7 +278,7 @@ class Sampler:
             Whether a plant is like those of the preset `hard`, shape (n,). The step test of
             such a plant finds the middle of the range of `hard`.
         is_exact
-            Whether the step test of another plant has no error, shape (n,).
+            Whether the step test finds the true value, for plants unlike `hard`, shape (n,).
 
         Returns
         -------

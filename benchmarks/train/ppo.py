@@ -39,6 +39,7 @@ TRAINING_SEEDS = SEEDS["training"].first  # least seed of the training plants
 # Change of the flow per sample at an action of 1, as a share of half the actuator's range: with
 # 2.0, the flow can cross the entire range in a sample.
 MAX_MOVE = 2.0
+SETPOINT_SCALE = 0.2  # from degC to an input of order 1
 
 
 class TrainingPlants(NamedTuple):
@@ -90,16 +91,18 @@ class Recipe:
 # the value function is learnt quickly.
 ERROR_SCALE = 50.0
 _COST = {"reward": "absolute", "error_scale": ERROR_SCALE}
-_RANDOM = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
-_SLOWER = {"setpoint_amplitude": 5.4, "setpoint_period": 500}
+_RANDOM: dict[str, Any] = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
+_NOISE = 0.6  # noise variance of most training plants of the recipe `ppo`, degC^2
+# The square wave of the validation differs from that of the published results.
+_VALIDATION: dict[str, Any] = {"setpoint_amplitude": 5.4, "setpoint_period": 500}
 
 RECIPES = {
     "ppo": Recipe(
         plants=(
             TrainingPlants(152, _RANDOM),
-            TrainingPlants(360, {**_RANDOM, "noise_variance": 0.6}),
+            TrainingPlants(360, {**_RANDOM, "noise_variance": _NOISE}),
         ),
-        cases={"calm": _SLOWER, "noise": {**_SLOWER, "noise_variance": 0.4}},
+        cases={"calm": _VALIDATION, "noise": {**_VALIDATION, "noise_variance": 0.4}},
         dead_zone=5.0,
         levels=False,
         hidden=(),
@@ -139,18 +142,20 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
         "reward": "absolute",
         "error_scale": ERROR_SCALE * amplitude,
         "setpoint": "random",
-        "setpoint_amplitude": 6.0 * amplitude,
+        "setpoint_amplitude": _RANDOM["setpoint_amplitude"] * amplitude,
     }
     noisy = dict(training)
     if parameters.range_of("noise_variance")[1] == 0.0:
         reach = "reach of half the flow's range, °C"
         ratio = scales(parameters)[reach] / scales(paper)[reach]
-        noisy["noise_variance"] = 0.6 * ratio**2
+        noisy["noise_variance"] = _NOISE * ratio**2
+    # A period of 500 samples for the paper's 600, and always an even number of samples.
+    half_period = max(1, round(parameters.setpoint_period * 500 / 1200))
     validation = {
         **plant,
         "setpoint": "square",
-        "setpoint_amplitude": 5.4 * amplitude,
-        "setpoint_period": max(2, 2 * round(parameters.setpoint_period * 500 / 1200)),
+        "setpoint_amplitude": _VALIDATION["setpoint_amplitude"] * amplitude,
+        "setpoint_period": 2 * half_period,
     }
     calm_kind, noisy_kind = RECIPES["ppo"].plants
     return replace(
@@ -278,15 +283,17 @@ def features(recipe: Recipe) -> Array:
     The shape is (inputs, size of the observation). The inputs are the error and the changes of
     set point, temperature and flow and, with `recipe.levels`, the set point and the flow.
     """
-    # As `inputs` is linear, its values for the rows of an identity matrix are the matrix.
-    identity = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
-    identity[: -recipe.memory] /= recipe.temperature_scale  # all but the flows are temperatures
-    columns = inputs(identity, recipe.windows)
+    # The inputs are linear in the observation. So row i of the transposed matrix is the inputs
+    # for an observation that is 1 at the element i and 0 elsewhere.
+    observations = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
+    # The last elements are the past flows; all elements before them are temperatures.
+    observations[: -recipe.memory] /= recipe.temperature_scale
+    transposed = inputs(observations, recipe.windows)
     if recipe.levels:
-        setpoint = 0.2 * identity[:, :1]
-        flow = identity[:, -recipe.memory, None]
-        columns = torch.hstack([columns, setpoint, flow])
-    return cast("Array", columns.numpy().T)
+        setpoint = SETPOINT_SCALE * observations[:, :1]
+        flow = observations[:, -recipe.memory, None]
+        transposed = torch.hstack([transposed, setpoint, flow])
+    return cast("Array", transposed.numpy().T)
 
 
 def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
