@@ -1,6 +1,6 @@
 """Add the repository's pages, pictures and tables to the site, and its source files as pages.
 
-MkDocs expects all pages in one folder, but those of this project are beside the code.
+MkDocs expects all pages in one folder, but the pages of this project are beside the code.
 """
 
 import re
@@ -56,7 +56,7 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """Return a page in HTML with corrections that Markdown does not allow."""
+    """Return a page in HTML with what Markdown cannot say, such as links around pictures."""
     html = html.replace("<p>::</p>\n", "")  # before literal blocks in docstrings
     # The environment's docstring gets the table of its arguments when it is imported.
     html = html.replace("<p><arguments></p>", ARGUMENTS)

@@ -35,7 +35,7 @@ class Case(NamedTuple):
 class Options:
     """Compare the steps a second of the environments with those of CartPole.
 
-    The cases of a table are timed in turns. A ratio compares two cases of the same round.
+    Each round times every case of a table once. A ratio compares two cases of the same round.
     """
 
     rounds: Runs = 15

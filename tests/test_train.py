@@ -25,7 +25,7 @@ from benchmarks.train.neural import (
     expected_error,
     mean_distance,
 )
-from benchmarks.train.plants import HOLDS, Sampler, environment
+from benchmarks.train.plants import HOLD_TIMES, Sampler, environment
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
 from tests.conftest import ROOT
@@ -63,7 +63,7 @@ class TestExpectedError:
         assert expected.item() == pytest.approx(errors[reached].mean().item(), rel=0.03)
 
     def test_changes_have_the_chance_that_the_environment_gives_them(self):
-        lengths = np.arange(HOLDS[0], HOLDS[1] + 1)
+        lengths = np.arange(HOLD_TIMES[0], HOLD_TIMES[1] + 1)
         for age, samples in ((0, 19), (85, 19), (150, 25), (270, 19), (299, 13)):
             left = lengths[lengths > age]
             share = (left <= age + samples).mean()
@@ -94,7 +94,7 @@ class TestSampler:
         changes = (batch.setpoints.diff(dim=0) != 0.0).nonzero()
         for plant in range(100):
             times = changes[changes[:, 1] == plant, 0]
-            assert (times.diff() > HOLDS[1]).all()
+            assert (times.diff() > HOLD_TIMES[1]).all()
 
 
 def test_a_seed_gives_a_network_that_differs_from_that_of_another():

@@ -34,7 +34,7 @@ MODULE_NAME = re.compile(r"\w+(\.(?!py$)\w+)*")
 @options
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
-    """A user's own controllers, and where controllers run."""
+    """The options that choose a user's own controllers, and where controllers run."""
 
     agent: Names = ()
     """A controller of your own, which runs in addition to those of --agents. Its form is

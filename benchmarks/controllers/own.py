@@ -52,10 +52,7 @@ class OwnController(ControllerSpec):
     def members(self) -> list[ControllerSpec]:
         """Load the factories, and return a record for each factory, in the order of locations.
 
-        Raises
-        ------
-        UsageError
-            If a factory cannot be loaded.
+        A `UsageError` is raised if a factory cannot be loaded.
         """
         members: list[ControllerSpec] = []
         for location in sorted(set(self.locations)):
@@ -80,10 +77,7 @@ class OwnController(ControllerSpec):
     def make(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller for a batch of runs, as `ControllerSpec.make` does.
 
-        Raises
-        ------
-        UsageError
-            If the factory cannot be called or raises an error.
+        A `UsageError` is raised if the factory cannot be called or raises an error.
         """
         with blame_user(f"{self.name}={self.locations[0]}", "made"):
             return super().make(plant, runs, seed)
@@ -98,11 +92,8 @@ class OwnController(ControllerSpec):
     ) -> Trajectory:
         """Run the controller on a batch of plants, as `ControllerSpec.run` does.
 
-        Raises
-        ------
-        UsageError
-            If the controller raises an error, returns invalid actions, or does not fit the
-            plants.
+        A `UsageError` is raised if the controller raises an error, returns invalid actions, or
+        does not fit the plants.
         """
         agent = controller or self.make(plant, runs, seed)
         with blame_user(f"{self.name}={self.locations[0]}", "run"):
@@ -213,21 +204,11 @@ def observation_of(factory: Factory) -> Mapping[str, int]:
 
 
 def make_controller(*, factory: Factory, **prior_knowledge: Any) -> Agent:
-    """Return a user's controller, made by calling the user's factory.
+    """Call a user's factory, and return the controller that the factory makes.
 
-    Parameters
-    ----------
-    factory
-        The factory.
-    prior_knowledge
-        What the controller may know about the plant: quantities by name. The factory is called
-        with the quantities that are among the parameters of the factory, or with all quantities
-        if the factory has `**kwargs`.
-
-    Raises
-    ------
-    ValueError
-        If the factory needs another argument.
+    `prior_knowledge` is what the controller may know about the plant, by name. The factory gets
+    what its parameters name, or everything if it has `**kwargs`. A ValueError is raised if the
+    factory needs another argument.
     """
     signature = inspect.signature(factory)
     parameters = signature.parameters
@@ -285,18 +266,9 @@ class PolicyAgent:
     def opened(self, samples: int, **arguments: Any) -> Iterator[Any]:
         """Yield a vector environment of `runs` plants with the wrappers that the policy needs.
 
-        Parameters
-        ----------
-        samples
-            Length of an episode, in samples.
-        arguments
-            Arguments of the environment that define the case.
-
-        Raises
-        ------
-        ValueError
-            If the policy brings its own environment and this environment has other parameters
-            than the case, or if the policy does not fit the observations.
+        Episodes have `samples` samples, and `arguments` are the arguments of the environment
+        that define the case. A ValueError is raised if the policy brings its own environment
+        for another case, or if the policy does not fit the observations.
         """
         case = case_of(Parameters(**arguments))
         with self._open({**arguments, "max_episode_steps": samples}) as plants:
@@ -308,7 +280,8 @@ class PolicyAgent:
     def _open(self, arguments: Mapping[str, Any]) -> AbstractContextManager[Any]:
         """Return a context with a vector environment of `runs` plants.
 
-        `arguments` are the keyword arguments of `gymnasium.make` that define the case.
+        `arguments` are the keyword arguments of `gymnasium.make` for the case, which an
+        environment that the policy brings does not need.
         """
         if self.env is not None:
             return opened(self.env, self.runs, self.policy)

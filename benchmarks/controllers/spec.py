@@ -49,7 +49,7 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
     runs
         Number of runs in a batch.
     seed
-        Seed of the first run; run i uses the seed `seed + i`.
+        Seed of the controller's random numbers in the first run; run i uses `seed + i`.
     """
     values: dict[str, Any] = {"parameters": plant, "num_envs": runs, "seed": seed}
     values["u_min"] = plant.range_of("u_min")[0]
@@ -118,8 +118,8 @@ class ControllerSpec:
         What was searched or trained beforehand, and in how many trials and samples, in words.
     tuned_by : str
         The argument of `build`, a time constant in s, that is chosen such that the loop with
-        the nominal plant has a maximum sensitivity of `sensitivity`. "" if no argument is
-        chosen in this way.
+        the nominal plant has a maximum sensitivity of `sensitivity`. The text is "" if the
+        controller has no such argument.
     sensitivity : float
         Ms, the largest magnitude of the sensitivity function of the loop.
     linear : bool
@@ -184,8 +184,8 @@ class ControllerSpec:
     def members(self) -> "list[ControllerSpec]":
         """Return a record for each trained network, in the order of the files' names.
 
-        Each record builds the controller with one network. Without networks, the list has only
-        this record.
+        Each record builds the controller with one network. If the controller has no networks,
+        the list consists of this record.
         """
         if self.networks is None:
             return [self]
@@ -202,9 +202,9 @@ class ControllerSpec:
         return members
 
     def with_few_networks(self) -> "ControllerSpec":
-        """Return a record with the first network only if the networks are alike.
+        """Return a record with the first network only, if the networks are alike.
 
-        Other records are returned unchanged.
+        A controller whose networks are not alike, or that has none, keeps its record.
         """
         networks = self.networks
         if networks is None or not self.networks_are_alike:
@@ -219,23 +219,17 @@ class ControllerSpec:
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
         """Return a record of the controller with fixed gains.
 
-        `gains` has arguments of `build` by name. If the argument `tuned_by` is among them, its
-        value is not chosen by `robust_time_constant` any more.
+        `gains` has arguments of `build` by name. If the argument `tuned_by` is among the
+        gains, `robust_time_constant` does not choose its value any more.
         """
         tuned_by = "" if self.tuned_by in gains else self.tuned_by
         return replace(self, build=partial(self.build, **gains), tuned_by=tuned_by)
 
     def make(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller for a batch of runs.
+        """Return a controller for a batch of `runs` runs.
 
-        Parameters
-        ----------
-        plant
-            The environment's arguments, from which the controller's prior knowledge follows.
-        runs
-            Number of runs in the batch.
-        seed
-            Seed of the controller's random numbers: run i uses the seed `seed + i`.
+        The controller's prior knowledge is that of `plant`, the environment's arguments. The
+        controller draws random numbers for run i with the seed `seed + i`.
         """
         parameters = Parameters(**{**plant, **self.observation})
         arguments = knowledge(self.prior_knowledge, parameters, runs, seed)
@@ -322,19 +316,11 @@ class ControllerSpec:
         return rollout(plants, agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller for a batch of runs, after `LEARNING` samples of learning.
+        """Make a controller for a batch of `runs` runs, let it learn if it can, and return it.
 
-        A controller that learns is run with the square wave on the plant; any other controller
-        is returned as `make` makes it.
-
-        Parameters
-        ----------
-        plant
-            The environment's arguments.
-        runs
-            Number of runs in the batch.
-        seed
-            Seed of the controller's random numbers: run i uses the seed `seed + i`.
+        Learning takes `LEARNING` samples of the square wave on the plant with the environment's
+        arguments `plant`. The controller draws random numbers for run i with the seed
+        `seed + i`.
         """
         controller = self.make(plant, runs, seed)
         if self.learns:

@@ -2,9 +2,9 @@
 
 The module of a command defines a dataclass `Options` and a function `work`. The docstrings of
 `Options` are the text of `--help`. The function `work` takes an instance of `Options`, writes
-the results and returns the last line to print. It imports packages that are slow to import
-itself, so that `--help` is quick. The line `main = command("NAME", Options, work)` makes the
-command.
+the results and returns the last line to print. Packages that are slow to import are imported
+within `work`, so that `--help` is quick. The line `main = command("NAME", Options, work)` makes
+the command.
 """
 
 import errno
@@ -106,6 +106,9 @@ def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[st
 def read(declared: type[Declared], program: str, words: Sequence[str]) -> Declared | None:
     """Convert the words of a command line to options, or print the help after `--help`.
 
+    The result is an instance of the dataclass `declared`, or None if the help was printed. A
+    `UsageError` is raised if an option is unknown or has an invalid value.
+
     Parameters
     ----------
     declared
@@ -114,16 +117,6 @@ def read(declared: type[Declared], program: str, words: Sequence[str]) -> Declar
         The command, such as "python -m benchmarks.compare", for the help.
     words
         The words of the command line after the command.
-
-    Returns
-    -------
-    object or None
-        An instance of `declared`; None if the help was printed.
-
-    Raises
-    ------
-    UsageError
-        If an option is unknown or has an invalid value.
     """
     defaults = Parameter(negative=(), allow_repeating=True, show_default=_as_typed)
     app = App(
@@ -234,8 +227,8 @@ def run_program(program: str, work: Callable[[], str]) -> int:
 def _interrupt_on_signals() -> None:
     """Make the first Ctrl-C or SIGTERM raise a KeyboardInterrupt in this process.
 
-    A signal that this process has ignored since its start stays ignored: so a shell protects a
-    command in the background from the user's Ctrl-C.
+    A signal that this process has ignored since its start stays ignored: a shell starts
+    commands in the background with Ctrl-C ignored.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:

@@ -1,4 +1,4 @@
-"""Define the errors that a command prints as a sentence, and print such a sentence."""
+"""Define the errors whose message a command prints without a traceback, and print a message."""
 
 import sys
 from typing import NoReturn

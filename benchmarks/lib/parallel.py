@@ -60,8 +60,8 @@ class FanOut:
         title
             Title of the progress bar.
         store
-            Stored results. A task whose result is stored is not run: its result is yielded
-            before all others. The results of tasks that run are added to the store.
+            Stored results, which are yielded first: their tasks are not run. The results of
+            tasks that run are added to the store.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class FanOut:
         Raises
         ------
         UnfinishedError
-            If the system killed a process that ran tasks. A task that fails raises nothing.
+            If the system killed a process that ran tasks.
         """
         import joblib  # imported here, as it is slow to import
 

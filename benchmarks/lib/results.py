@@ -140,7 +140,7 @@ def _refuse_other_files(final: Path) -> None:
 
 
 def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
-    """Prepare the folder that `results_folder` yields, `unfinished`.
+    """Prepare the folder `unfinished`, which `results_folder` yields.
 
     If a run with equal `conditions` has left the folder, the folder stays as it is. Otherwise,
     and if `conditions` is None, the folder becomes empty except for the file `RECORD`.

@@ -6,11 +6,13 @@ actuator and control law. The literature calls this training differentiable pred
 model predictive control for unknown nonlinear systems", Journal of Process Control 116, 2022,
 80-92).
 
-The training is fast for two reasons. Only the control law and the plant have gradients: the
-bank of models and its estimates are computed in NumPy, and count as constants. And the loss is
-an expected error: the error at sample k depends on commands up to k - d - 1, for the plant's
-delay d, so noise and changes of the set point after the sample k - d - 1 are averaged by a
-formula and not by random samples.
+The training is fast for two reasons:
+
+- Only the control law and the plant have gradients. The bank of models and its estimates are
+  computed in NumPy, and count as constants.
+- The loss is an expected error. The error at the sample k depends on commands up to the sample
+  k - d - 1, where d is the plant's delay. The effects of later noise and of later changes of
+  the set point are averaged by a formula, and not by random samples.
 """
 
 import copy
@@ -29,7 +31,15 @@ from agents.law import INPUTS, OUTPUTS, Law, Observer
 from benchmarks.controllers.roster import with_bank
 from benchmarks.controllers.spec import BANK, knowledge
 from benchmarks.lib.provenance import versions
-from benchmarks.train.plants import HOLDS, PAPER, POLE, SAMPLES, Batch, Sampler, environment
+from benchmarks.train.plants import (
+    HOLD_TIMES,
+    PAPER,
+    POLE,
+    SAMPLES,
+    Batch,
+    Sampler,
+    environment,
+)
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.torch_env import MiddlePointTorchEnv
@@ -88,8 +98,8 @@ class Net(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Return the corrections of the control law at a sample, and update `state`.
 
-        `inputs` are those of `agents.law`, shape (n, INPUTS), and the corrections have the
-        shape (n, OUTPUTS).
+        `inputs` are the inputs that `agents.law` computes, shape (n, INPUTS). The corrections
+        have the shape (n, OUTPUTS).
         """
         self.state = self.cell(inputs, self.state)
         hidden = nn.functional.silu(self.hidden(torch.cat([inputs, self.state], dim=1)))
@@ -126,11 +136,11 @@ class Loops:
     plants
         The differentiable environment.
     batch
-        Plant numbers, set points and noise of an episode, and what controllers know.
+        Plant numbers, set points and noise of an episode, and what controllers know of plants.
     net
         The network that corrects the control law.
     seed
-        Seed of the environment's reset, for all that `batch` does not determine.
+        Seed of the environment, for random numbers that `batch` does not contain.
     """
 
     def __init__(self, plants: MiddlePointTorchEnv, batch: Batch, net: Net, seed: int) -> None:
@@ -216,9 +226,9 @@ def chance_of_change(ages: Tensor, samples: Tensor) -> Tensor:
     ages
         Number of samples since the last change of the set point.
     samples
-        Number of future samples; the shapes of both arguments broadcast.
+        Number of future samples, in a shape that broadcasts with the shape of `ages`.
     """
-    shortest, longest = HOLDS
+    shortest, longest = HOLD_TIMES
     # A hold time is longer than `passed`, and all longer hold times are equally probable.
     passed = ages.clamp(min=shortest - 1.0)
     possible_hold_times = (longest - passed).clamp(min=1.0)
@@ -243,8 +253,8 @@ def filtered(innovations: Tensor, responses: Tensor) -> Tensor:
     Parameters
     ----------
     innovations
-        The white noise of n plants. It begins as many samples before the first result as the
-        impulse response reaches back, shape (samples + lags - 1, n).
+        The white noise of n plants, shape (samples + lags - 1, n). The first lags - 1 values
+        are those before the first result.
     responses
         The impulse response for each plant, shape (lags, n).
     """
@@ -260,10 +270,10 @@ def expected_error(
     """Return the loss: the mean over samples and plants of the expected |e(k)|, degC.
 
     The error e(k) is the set point minus the output y(k). The last command that affects y(k) is
-    that of the sample k - d - 1, where d is the plant's delay. The expectation of |e(k)| is
-    that at the sample k - d - 1: the effect of later noise xi on y(k) is subtracted, and
-    replaced by a normal distribution; and the set point may change after k - d - 1 to a level
-    that is uniformly distributed. Samples k up to d, which no command affects, do not count.
+    the command of the sample k - d - 1, where d is the plant's delay. The expectation is that
+    of an observer at the sample k - d - 1. For the observer, the effect of later noise xi on
+    y(k) has a normal distribution, and the set point may change later to a level that is
+    uniformly distributed. Samples k up to d, which no command affects, do not count.
 
     Parameters
     ----------
@@ -306,10 +316,10 @@ def expected_error(
 
 
 def validate(network: RecurrentNetwork, episodes: int) -> dict[str, float]:
-    """Return the results of a network's validation: "mean_error", degC, and "travel", t/h.
+    """Return a network's "mean_error", degC, and "travel" (of the valve, t/h), in validation.
 
     The network corrects the self-tuning controller on `episodes` validation episodes of the
-    environment `MiddlePointHard-v0`. The travel is that of the valve.
+    environment `MiddlePointHard-v0`.
     """
     plant = Parameters(**PRESETS["hard"])
     known = knowledge(BANK, plant, episodes, VALIDATION_SEED)
@@ -319,7 +329,7 @@ def validate(network: RecurrentNetwork, episodes: int) -> dict[str, float]:
 
 
 def train(training: Training, seed: int) -> RecurrentNetwork:
-    """Train a network, and return it with the results of its validation.
+    """Train a network, and return the network with the results of its validation.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ POLE: Final = float(np.abs(np.roots(PAPER.a)).max())  # its pole of the dominant
 HALF_RANGE: Final = (PAPER.range_of("u_max")[1] - PAPER.range_of("u_min")[0]) / 2.0
 HARD: Final = PRESETS["hard"]  # arguments of the environment `MiddlePointHard-v0`
 # Shortest and longest time for which a random set point of `hard` keeps a level, samples.
-HOLDS: Final = (100, 300)
+HOLD_TIMES: Final = (100, 300)
 # A hold time that never ends, samples, for set points that do not change at random.
 UNCHANGED: Final = 1e30
 DELAYS: Final = 13  # number of delays in the bank of models of each plant
@@ -116,15 +116,15 @@ class Sampler:
     of all plants that are not like `hard` last longer than those of `hard`, and mostly
     alternate between a positive and a negative value.
 
-    A network that was trained with a seed can be reproduced only if all random numbers of a
-    batch are drawn in the same order.
+    If random numbers were drawn in another order, a seed would no longer give the network that
+    was published with the seed.
 
     Parameters
     ----------
     n
         Number of plants in a batch.
     hard_share
-        Share of the plants that are like those of `hard`.
+        Share of the plants that are like the plants of the preset `hard`.
     seed
         Seed of all random numbers.
     """
@@ -155,8 +155,8 @@ class Sampler:
         widest_zones = self._widest_dead_zones(numbers["dead_zone"], is_hard, is_exact)
         authorities = (gain_factors * GAIN * HALF_RANGE).numpy()
         random_setpoint = RandomSetpoint(
-            shortest=np.where(is_hard, HOLDS[0], 0.0),
-            longest=np.where(is_hard, HOLDS[1], UNCHANGED),
+            shortest=np.where(is_hard, HOLD_TIMES[0], 0.0),
+            longest=np.where(is_hard, HOLD_TIMES[1], UNCHANGED),
             amplitude=amplitudes.numpy() / authorities,
         )
         return Batch(
@@ -189,7 +189,7 @@ class Sampler:
         """Return random delays, gains and other numbers of the plants, each of shape (n,).
 
         The keys are the names of the environment's arguments. `is_hard` says which plants are
-        like those of the preset `hard`, shape (n,). Plants unlike `hard` have numbers from wider
+        like those of the preset `hard`, shape (n,). All other plants have numbers from wider
         ranges.
         """
         is_noisy = self._true_for(0.65)
@@ -239,7 +239,7 @@ class Sampler:
         those of the preset `hard`, both of shape (n,). Both results have the shape
         (SAMPLES + 1, n).
         """
-        shortest_hard, longest_hard = HOLDS
+        shortest_hard, longest_hard = HOLD_TIMES
         shortest_other = self._uniform(longest_hard + 10.0, 700.0)
         shortest = torch.where(is_hard, float(shortest_hard), shortest_other)
         longest = torch.where(is_hard, float(longest_hard), shortest + longest_hard)
@@ -275,8 +275,8 @@ class Sampler:
         spread
             Standard deviation of the logarithm of the ratio of a found value to the true value.
         is_hard
-            Whether a plant is like those of the preset `hard`, shape (n,). The step test of
-            such a plant finds the middle of the range of `hard`.
+            Whether a plant is like those of the preset `hard`, shape (n,). Then the step test
+            finds the middle of the range of `hard`.
         is_exact
             Whether the step test finds the true value, for plants unlike `hard`, shape (n,).
 
@@ -339,9 +339,10 @@ class Sampler:
     ) -> Tensor:
         """Return the greatest half width that each dead zone may have, t/h, shape (n,).
 
-        Controllers know this number. It is the plant's own half width, `dead_zones`, if an
-        exact step test has shown the plant (`is_exact`), and that of the preset `hard` for
-        plants like those of `hard` (`is_hard`). All arguments have the shape (n,).
+        Controllers know the greatest half width. With an exact step test (`is_exact`), it is
+        the half width of the plant's own dead zone, `dead_zones`. For plants like those of the
+        preset `hard` (`is_hard`), it is the greatest half width in `hard`. All arguments have
+        the shape (n,).
         """
         margins = self._uniform(0.0, 3.0) * ~is_exact
         widest = (dead_zones + margins).clamp(max=8.0)

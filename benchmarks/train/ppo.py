@@ -123,7 +123,7 @@ RECIPES = {
 
 
 def for_plant(plant: Mapping[str, Any]) -> Recipe:
-    """Return the recipe `ppo` for another plant than the paper's.
+    """Return the recipe `ppo`, adapted to a plant that is not the paper's.
 
     Set points, errors and temperatures are scaled in proportion to `setpoint_amplitude`. If the
     plant has no noise, most training plants get noise in proportion to the largest temperature
@@ -181,8 +181,8 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
     seed
         Seed of the initial weights, the exploration and the plants.
     plant
-        Arguments of the environment for the plant that the recipe was made for by `for_plant`;
-        None for one of `RECIPES`.
+        Arguments of the environment for the plant, if `for_plant` has made the recipe. None if
+        the recipe is one of `RECIPES`.
     """
     began = time.process_time()
     model = begin(recipe, seed)
@@ -265,9 +265,9 @@ class Plants(GymnasiumVecEnv):
         return super().reset() @ self._features
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all plants by the actions of `step_async`; return what `VecEnv` asks for.
+        """Step all plants by the actions of `step_async`, as a `VecEnv` does.
 
-        Observations, and the last observations of ended episodes in the infos, are converted to
+        The returned observations, and the last observations of ended episodes in the infos, are
         the policy's inputs.
         """
         observations, rewards, ended, infos = super().step_wait()
