@@ -24,8 +24,8 @@ assert {file.partition("/")[0] for file in files} == {"mptc_gym", info}, sorted(
 shipped = {f"mptc_gym/{name}" for name in ("py.typed", "CHANGELOG.md", "bounds.json")}
 shipped.add(f"{info}/licenses/LICENSE")
 assert shipped <= files, sorted(files)
-present = [name for name in ABSENT if find_spec(name)]
-assert not present, present
+brought_along = [name for name in ABSENT if find_spec(name)]
+assert not brought_along, brought_along
 
 about = installed.metadata
 assert about["License-Expression"] == "MIT"
@@ -36,16 +36,17 @@ assert "MiddlePoint-v0" in readme
 links = re.findall(r"(!?)\[[^]]*\]\(([^)]*)\)", readme)
 relative = [target for _, target in links if not target.startswith("https:")]
 pictures = [target for picture, target in links if picture]
-urls = dict(each.split(", ", 1) for each in about.get_all("Project-URL", []))
+assert pictures
+urls = dict(url.split(", ", 1) for url in about.get_all("Project-URL", []))
 if "Repository" in urls:
     assert not relative, relative
-    files_at = urls["Repository"].rstrip("/") + "/raw/HEAD/"
-    assert all(picture.startswith(files_at) for picture in pictures), pictures
+    raw_files = urls["Repository"].rstrip("/") + "/raw/HEAD/"
+    assert all(picture.startswith(raw_files) for picture in pictures), pictures
 else:
     assert relative
-assert pictures
-needed = [each for each in installed.requires or () if "extra ==" not in each]
-assert sorted(each.partition(">=")[0] for each in needed) == ["gymnasium", "numpy"], needed
+needed = [package for package in installed.requires or () if "extra ==" not in package]
+names = sorted(package.partition(">=")[0] for package in needed)
+assert names == ["gymnasium", "numpy"], needed
 
 env = gymnasium.make("mptc_gym:MiddlePoint-v0", noise_variance=0.5)
 check_env(env.unwrapped, skip_render_check=True)  # rendering needs an extra
@@ -66,6 +67,6 @@ assert Path(mptc_gym.__file__).is_relative_to(sys.prefix), mptc_gym.__file__
 assert mptc_gym.__version__ == installed.version
 changelog = Path(mptc_gym.__file__).with_name("CHANGELOG.md").read_text(encoding="utf-8")
 assert f"## {installed.version} (" in changelog  # with a date
-idle = mptc_gym.evaluate(lambda seen: 0.0 * seen[:, :1], "MiddlePointHard-v0")
+idle = mptc_gym.evaluate(lambda observations: 0.0 * observations[:, :1], "MiddlePointHard-v0")
 assert abs(idle.score) < 1e-9 < idle.least_possible < idle.mean_error, idle
 print(f"mptc_gym {installed.version} is complete and runs, with nothing but {needed}")

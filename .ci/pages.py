@@ -1,6 +1,6 @@
 """Add the repository's pages, pictures and tables to the site, and its source files as pages.
 
-MkDocs expects all pages in one folder, but those of this project are beside the code.
+MkDocs expects all pages in one folder, but the pages of this project are beside the code.
 """
 
 import re
@@ -17,20 +17,28 @@ from mptc_gym.plant.parameters import argument_table
 
 ROOT = Path(__file__).parent.parent
 CONTRIBUTING = ".github/CONTRIBUTING.md"
+# Suffixes of the files that the site shows or offers as they are.
 SHOWN = {".csv", ".gif", ".ipynb", ".json", ".md", ".png", ".txt", ".yml"}
-TABLE = markdown.markdown(argument_table(), extensions=["tables"])
-CONSTANTS = re.compile(r'<span class="n">(SEED|EPISODES)</span>')  # in signatures
+ARGUMENTS = markdown.markdown(argument_table(), extensions=["tables"])  # a table in HTML
+# Names of constants of `mptc_gym.evaluation` in a signature, in HTML.
+CONSTANT = re.compile(r'<span class="n">(SEED|EPISODES)</span>')
 PICTURE = re.compile(r'(<img [^>]*src="([^"]+)"[^>]*>)')
-TO_SOURCE = re.compile(r"(\]\((?!https?:)[^)#]+\.py)\)")
+# The end of a relative link to a source file, in Markdown.
+LINK_TO_SOURCE = re.compile(r"(\]\((?!https?:)[^)#]+\.py)\)")
 
 
 @event_priority(100)  # before plugins that look for their own files, such as notebooks
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the tracked pages and the files that they show, and a page for each source file."""
+    """Add the pages of the checkout, the files that they show, and a page for each source file.
+
+    Only files in git are added. `files` are the files of the site, and are also returned.
+    """
     tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True)
     for name in tracked.splitlines():
         path = ROOT / name
-        if (name.startswith((".", "tests")) and name != CONTRIBUTING) or not path.exists():
+        if name.startswith((".", "tests")) and name != CONTRIBUTING:
+            continue
+        if not path.exists():  # a file that was removed after the latest commit
             continue
         if path.suffix in SHOWN or name == "LICENSE":
             files.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
@@ -43,17 +51,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Point links to source files at their pages."""
-    return TO_SOURCE.sub(r"\1.md)", markdown)
+    """Return a page in Markdown, with links to the pages of source files."""
+    return LINK_TO_SOURCE.sub(r"\1.md)", markdown)
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """Link each picture to its full-size version, for small screens; show values of constants.
-
-    Remove the `::` before literal blocks in docstrings, which Markdown does not know, and put
-    in the table of arguments, which the environment's docstring gets when it is imported.
-    """
-    html = html.replace("<p>::</p>\n", "").replace("<p><arguments></p>", TABLE)
-    html = CONSTANTS.sub(lambda name: f"{getattr(evaluation, name[1]):_}", html)
+    """Return a page in HTML with what Markdown cannot say, such as links around pictures."""
+    html = html.replace("<p>::</p>\n", "")  # before literal blocks in docstrings
+    # The environment's docstring gets the table of its arguments when it is imported.
+    html = html.replace("<p><arguments></p>", ARGUMENTS)
+    # A value has groups of digits, as in 5_000_000.
+    html = CONSTANT.sub(lambda name: f"{getattr(evaluation, name[1]):_}", html)
     html = html.replace('href="README.md"', 'href="../"')  # in the notebook
+    # On a small screen, a click shows the picture in full size.
     return PICTURE.sub(r'<a href="\2">\1</a>', html)

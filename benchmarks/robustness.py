@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from benchmarks.controllers.roster import ROSTER, label
 from benchmarks.controllers.spec import ROBUSTNESS
-from benchmarks.lib.command import FanOut, Folder, Runs, command, options
+from benchmarks.lib.command import Folder, Runs, command, options
+from benchmarks.lib.parallel import FanOut
 from benchmarks.lib.provenance import origin
 from benchmarks.lib.results import results_folder
 from benchmarks.lib.storage import write_csv

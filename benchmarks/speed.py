@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.lib.command import Runs, blame, command, options
 from mptc_gym import PRESETS
 
-EPISODE = 1200  # steps in an episode of the plant
+EPISODE = 1200  # number of steps in an episode of the plant
 BATCHES = (1, 8, 64, 1024, 16384)  # numbers of plants that are stepped together
 # Numbers of plants with the option --device: 1,024 to 4,194,304.
 ON_DEVICE = tuple(4**power for power in range(5, 12))
@@ -35,11 +35,11 @@ class Case(NamedTuple):
 class Options:
     """Compare the steps a second of the environments with those of CartPole.
 
-    The cases of a table are timed in turns. A ratio compares two cases of the same round.
+    Each round times every case of a table once. A ratio compares two cases of the same round.
     """
 
     rounds: Runs = 15
-    """Number of measurements of each case."""
+    """The number of measurements of each case."""
     device: str | None = None
     """Measure only the PyTorch environment, on this device, such as cuda."""
 
@@ -52,8 +52,9 @@ def work(options: Options) -> str:
     with blame("--device"):
         for n in numbers_of_plants:
             environments = make_environments(n, options.device)
-            cases = {name: stepping(envs) for name, envs in environments.items()}
-            print(f"\nn = {n:,}\n{on_screen(compare(cases, options.rounds))}", flush=True)
+            cases = {name: stepping(env) for name, env in environments.items()}
+            table = on_screen(compare(cases, options.rounds))
+            print(f"\nn = {n:,}\n{table}", flush=True)
     return f"Medians of {options.rounds} rounds; in parentheses, 10th to 90th percentile."
 
 
@@ -84,32 +85,31 @@ def make_environments(n: int, device: str | None) -> dict[str, Any]:
     return environments
 
 
-def stepping(envs: Any) -> Case:
+def stepping(env: Any) -> Case:
     """Return a case that steps an environment with random actions.
 
-    A single environment is stepped for ten times the length of the plant's episode, and reset
-    at the end of each of its own episodes. A vector environment is stepped for one episode of
-    the plant, and resets itself. If the environment runs on a device, the function of the case
-    waits until the device has finished all steps.
+    A vector environment is stepped for one episode of the plant, and resets itself. A single
+    environment is stepped for ten times as long, and is reset at the end of each of its own
+    episodes.
 
     Parameters
     ----------
-    envs
+    env
         A Gymnasium environment, a Gymnasium vector environment, or a `MiddlePointTorchEnv`.
     """
-    is_single = isinstance(envs, gymnasium.Env)
+    is_single = isinstance(env, gymnasium.Env)
     if is_single:
         plants = 1
         steps = 10 * EPISODE
         distinct_actions = EPISODE
     else:
-        plants = envs.num_envs
+        plants = env.num_envs
         steps = EPISODE + 1  # the episode, and the reset after it
         distinct_actions = 20
-    envs.reset(seed=0)
-    envs.action_space.seed(0)
-    actions = [envs.action_space.sample() for _ in range(distinct_actions)]
-    device = getattr(envs, "device", None)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(distinct_actions)]
+    device = getattr(env, "device", None)  # that of the PyTorch environment
     if device is not None:
         import torch
 
@@ -118,13 +118,13 @@ def stepping(envs: Any) -> Case:
     def run() -> None:
         """Make all steps of the case."""
         for k in range(steps):
-            _, _, terminated, truncated, _ = envs.step(actions[k % len(actions)])
+            _, _, terminated, truncated, _ = env.step(actions[k % distinct_actions])
             if is_single and (terminated or truncated):
-                envs.reset()
+                env.reset()
         if device is not None and device.type != "cpu":
-            torch.accelerator.synchronize()
+            torch.accelerator.synchronize()  # A device may not have finished all steps yet.
 
-    envs.step(actions[0])  # The first step is slow on a device.
+    env.step(actions[0])  # The first step is slow on a device.
     return Case(run, steps * plants)
 
 
@@ -135,9 +135,9 @@ def compare(cases: Mapping[str, Case], rounds: int) -> Any:
     second, and the ratio to the first case: the median of the quotients of the steps per second
     in the same round, with the 10th and the 90th percentile in parentheses.
     """
-    import pandas as pd  # here, as in all commands: it would slow the help down
+    import pandas as pd  # imported here, as in all commands: it would slow the help down
 
-    seconds = []
+    seconds = []  # of each round, a list with the duration of each case
     for _ in range(rounds):
         times = [time.perf_counter()]
         for case in cases.values():
@@ -146,19 +146,15 @@ def compare(cases: Mapping[str, Case], rounds: int) -> Any:
         seconds.append(np.diff(times))
     steps = [case.steps for case in cases.values()]
     rates = pd.DataFrame(steps / np.array(seconds), columns=[*cases])
-    first = rates.columns[0]
-    ratios = rates.div(rates[first], axis="index").quantile([0.1, 0.5, 0.9])
-    texts = ratios.map("{:.2f}".format)
-    table = {
-        "steps a second": rates.median().map("{:,.0f}".format),
-        f"ratio to {first}": texts.loc[0.5]
-        + " ("
-        + texts.loc[0.1]
-        + " to "
-        + texts.loc[0.9]
-        + ")",
-    }
-    return pd.DataFrame(table).reset_index(names="case")
+    reference = rates.columns[0]
+    ratios = rates.div(rates[reference], axis="index")
+    low, median, high = ratios.quantile([0.1, 0.5, 0.9]).to_numpy()
+    table = pd.DataFrame({"case": [*cases]})
+    table["steps a second"] = [f"{rate:,.0f}" for rate in rates.median()]
+    table[f"ratio to {reference}"] = [
+        f"{median[i]:.2f} ({low[i]:.2f} to {high[i]:.2f})" for i in range(len(cases))
+    ]
+    return table
 
 
 main = command("speed", Options, work)

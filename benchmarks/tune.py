@@ -20,8 +20,8 @@ from benchmarks.lib.command import (
     blame,
     command,
     options,
-    progress_bar,
 )
+from benchmarks.lib.parallel import progress_bar
 from benchmarks.lib.provenance import origin
 from benchmarks.lib.results import KeptResults, conditions_of, results_folder
 from benchmarks.lib.seeds import SEEDS

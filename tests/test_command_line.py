@@ -14,11 +14,16 @@ import pytest
 
 pytest.importorskip("cyclopts", reason="the commands need the extra compare")
 
-from benchmarks.__main__ import commands
 from benchmarks.lib.command import read
 from tests.conftest import ROOT, python
 
-COMMANDS = commands()
+# The modules of the commands `python -m benchmarks.NAME`, by NAME.
+COMMANDS = {
+    path.stem: f"benchmarks.{path.stem}"
+    for path in sorted((ROOT / "benchmarks").glob("[a-z]*.py"))
+}
+for path in (ROOT / "benchmarks").glob("*/__main__.py"):
+    COMMANDS[path.parent.name] = f"benchmarks.{path.parent.name}.__main__"
 HEAVY = {
     "joblib", "matplotlib", "optuna", "pandas", "pygame", "ray", "scipy", "stable_baselines3",
     "torch",
@@ -53,7 +58,7 @@ REFUSED = {
     "compare": [
         (["--agents", "nn", "pie"], "--agents: there is no 'pie'; choose from idle, nn, "),
         (["--agents", "nothing"], "--agents: 'nothing' is now called 'idle'"),
-        (["--agent", "mine=none.json"], "must be .* of a module or a file that exists"),
+        (["--agent", "mine=none.json"], "needs the file .none.json., which does not exist"),
         (["--agents"], "name at least one controller"),
         (["--scenarios", "circle"], "no 'circle'"),
         (["--scenarios"], "--scenarios: name at least one case"),
@@ -67,7 +72,10 @@ REFUSED = {
         (["--set", "render_mode=human"], "--set: render_mode is not an argument of the plant"),
         (["--agent", "PI=agents:PIController"], "'PI' is taken"),
         (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
-        (["--out", ""], "--out: must name a folder"),
+        (["--agent", "mine=my_controllers.py:PI"], r"\(MODULE without \.py\)"),
+        (["--agent", "mine=my_controllers:PI"], "needs the module .my_controllers., which is"),
+        (["--agent", "mine=PPO:none.zip"], "needs the file .none.zip., which does not exist"),
+        (["--out", ""], "--out: . must not be the current folder"),
         (["--out", "/proc/here"], "cannot be written to: "),
     ],
     "datasets": [(["middlepoint/paper/ppo-v0"], 'Choose from: "middle')],
@@ -92,7 +100,7 @@ REFUSED = {
         (["pi"], '"pi" for NETWORK. Choose from: "neural", "ppo"'),
     ],
     "watch": [
-        (["--agent", "pi=none"], "--agent: .pi=none. must be .*; .pi. is taken"),
+        (["--agent", "pi=none"], "--agent: .pi=none. must have the form NEW_NAME=MODULE"),
         (["--agent", "nn-smith"], "--agent: 'nn-smith' is now called 'neural-smith'"),
         (["--agent", "agents:Nobody"], "--agent.*Nobody"),
         (["--scenario", "triangle"], "--scenario.*constant-noise"),
@@ -177,7 +185,7 @@ import pathlib, signal, sys, time
 from dataclasses import dataclass, field
 from functools import partial
 from benchmarks.lib.command import command, options
-from benchmarks.lib.command import FanOut
+from benchmarks.lib.parallel import FanOut
 from benchmarks.lib.storage import write_text
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # however this was started
@@ -190,7 +198,8 @@ class Options:
 def work(options):
     try:
         print("up", flush=True)
-        dict(options.fan_out.stream({name: partial(time.sleep, 60) for name in "abcd"}))
+        tasks = {name: partial(time.sleep, 60) for name in "abcd"}
+        dict(options.fan_out.stream(tasks, "tasks"))
     finally:
         print("writes", flush=True)
         time.sleep(2)

@@ -131,13 +131,27 @@ class TestOwnControllers:
             ("def Mine(:", "--agent: .* cannot be loaded: SyntaxError"),
             ("raise SystemExit(3)", "--agent: .* cannot be loaded: SystemExit: 3"),
             ("class Mine: pass", "policy must be a function, .*, or an object with pre"),
-            ("class Mine: observation = 3", "--agent: .* cannot be loaded: TypeError"),
+            ("class Mine: observation = 3", "cannot be loaded: .* a dict .* got 3"),
             ("class Mine: observation = {'delay': 0}", "out of .* got {'delay': 0}"),
             (
                 "class Mine: reset = dict; act = lambda self, o: 0.0",
                 r"policy must return finite actions, shape \(2, 1\), got .*, shape \(\)",
             ),
-            ("class Mine: __init__ = lambda self, gain: None", "argument: 'gain'"),
+            (
+                "class Mine: reset = dict; act = lambda self, o: o[:, :1] + float('nan')",
+                r"mine=own_\d+:Mine' cannot be run: policy must return finite .*, got",
+            ),
+            (
+                "class Mine: reset = dict; act = lambda self, o: 1 / 0",
+                r"mine=.* cannot be run: ZeroDivisionError: [^\n]+\n\nTraceback",
+            ),
+            ("Mine = 3", r"mine=.* cannot be loaded: 'Mine' must be a function or a class"),
+            ("Yours = 3", r"mine=.* cannot be loaded: the module '\w+' has no 'Mine'"),
+            ("def Mine(): return 1 / 0", r"mine=.* cannot be made: ZeroDivisionError"),
+            (
+                "class Mine: __init__ = lambda self, gain: None",
+                r"mine=.* cannot be made: .*argument: 'gain': a factory gets only \w+",
+            ),
             (
                 "from mptc_gym import MiddlePointEnv as E\ndef Mine(): return (lambda o: o), E",
                 "must have the parameters of the case",
@@ -145,8 +159,11 @@ class TestOwnControllers:
         ],
     )
     def test_bad_ones(self, code, complaint, written):
-        with pytest.raises((TypeError, ValueError), match=complaint):
+        with pytest.raises(UsageError, match=complaint) as error:
             members_of(written(code))[0].run({"delay": 3}, 2, 2, 0)
+        # A traceback follows where the user's code has failed.
+        has_traceback = "Traceback" in str(error.value)
+        assert has_traceback == bool(re.search("Error: |SystemExit: ", str(error.value)))
 
     def test_the_same_name_again_is_another_training(self, written):
         other = written("from agents import PIController as Mine")
@@ -229,8 +246,8 @@ class TestSavedPolicies:
             ("No:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("SAC:{}/bare.zip", "bare.zip' cannot be loaded"),
             ("PPO:{}/nan.zip", "Expected parameter loc"),
-            ("{}/velocity.zip", "must be NEW_NAME=.* that exists"),
-            ("PPO:{}/none.zip", "must be NEW_NAME=.* that exists"),
+            ("{}/velocity.zip", "must have the form NEW_NAME="),
+            ("PPO:{}/none.zip", "none.zip., which does not exist"),
         ],
     )
     def test_what_is_refused(self, location, complaint, zips):

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
@@ -16,8 +15,8 @@ import joblib
 import numpy as np
 import pytest
 
-from benchmarks.lib.command import FanOut
 from benchmarks.lib.errors import UnfinishedError, UsageError
+from benchmarks.lib.parallel import FanOut
 from tests.conftest import ROOT, python
 
 
@@ -48,7 +47,7 @@ def work(n, calls=None):
 
 
 def run(given, jobs=2):
-    return dict(FanOut(jobs=jobs).stream(given))
+    return dict(FanOut(jobs=jobs).stream(given, "tasks"))
 
 
 def test_jobs_and_order_do_not_matter():
@@ -67,10 +66,25 @@ def test_an_exception_names_its_task_and_spares_the_others(jobs):
     faulty = {"the fault": partial(fail, 3), "left": partial(sys.exit, 3)}
     done = {}
     with pytest.raises(UnfinishedError, match="no such plant as 3") as error:
-        done.update(FanOut(jobs=jobs).stream({**faulty, **work(4)}))
+        done.update(FanOut(jobs=jobs).stream({**faulty, **work(4)}, "tasks"))
     assert "2 of 6 tasks failed" in str(error.value)
     assert "left: SystemExit: 3" in str(error.value)
     assert done == {f"plant {seed}": draw(seed) for seed in range(4)}
+
+
+def refuse():
+    raise UsageError("--agent: a controller cannot be run: no reason\n\nTraceback of the user")
+
+
+def test_an_error_of_the_user_is_listed_by_its_first_line():
+    with pytest.raises(UnfinishedError) as error:
+        run({"mine, square": refuse, "mine, constant": refuse}, jobs=1)
+    lines = str(error.value).splitlines()
+    assert lines[1:3] == [
+        "mine, square: --agent: a controller cannot be run: no reason",
+        "mine, constant: --agent: a controller cannot be run: no reason",
+    ]
+    assert lines[-1] == "Traceback of the user"
 
 
 def test_a_killed_process_is_a_sentence():
@@ -85,12 +99,13 @@ RAY = """
 import os
 from functools import partial
 from ray.cluster_utils import Cluster
-from benchmarks.lib.command import FanOut
+from benchmarks.lib.parallel import FanOut
 node = {"num_cpus": 2, "object_store_memory": 80_000_000, "include_dashboard": False}
 cluster = Cluster(initialize_head=True, head_node_args=node)
 os.environ["RAY_ADDRESS"] = cluster.address
 work = {f"plant {seed}": partial(pow, 0.1, seed) for seed in range(3)} | {"where": os.getpid}
-there, here = dict(FanOut(backend="ray").stream(work)), dict(FanOut(jobs=1).stream(work))
+there = dict(FanOut(backend="ray").stream(work, "on the cluster"))
+here = dict(FanOut(jobs=1).stream(work, "here"))
 assert there.pop("where") != here.pop("where") and there == here, there
 print("the same numbers")
 cluster.shutdown()
@@ -118,15 +133,7 @@ def test_where_there_is_no_cluster_it_says_so(monkeypatch):
     pytest.importorskip("ray", reason="Ray is not installed")
     monkeypatch.setenv("RAY_ADDRESS", "nowhere")  # "auto" would find those of other users
     with pytest.raises(UsageError, match="--backend: no Ray cluster can be reached: start one"):
-        dict(FanOut(backend="ray").stream(work(1)))
-
-
-def test_tasks_can_be_run_from_a_thread():
-    before = signal.getsignal(signal.SIGINT)
-    with ThreadPoolExecutor() as threads:
-        results = threads.submit(run, work(3)).result()
-    assert results == {f"plant {seed}": draw(seed) for seed in range(3)}
-    assert signal.getsignal(signal.SIGINT) is before
+        dict(FanOut(backend="ray").stream(work(1), "tasks"))
 
 
 def test_an_error_of_joblib_leaves_the_signals_as_they_were(monkeypatch):
@@ -140,14 +147,14 @@ def test_an_error_of_joblib_leaves_the_signals_as_they_were(monkeypatch):
 ORPHANS = """
 import os, pathlib, sys, time
 from functools import partial
-from benchmarks.lib.command import FanOut
+from benchmarks.lib.parallel import FanOut
 
 def wait(folder):
     (folder / str(os.getpid())).touch()
     time.sleep(120)
 
 folder = pathlib.Path(sys.argv[1])
-dict(FanOut(jobs=2).stream({name: partial(wait, folder) for name in "ab"}))
+dict(FanOut(jobs=2).stream({name: partial(wait, folder) for name in "ab"}, "tasks"))
 """
 
 

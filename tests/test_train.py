@@ -25,7 +25,7 @@ from benchmarks.train.neural import (
     expected_error,
     mean_distance,
 )
-from benchmarks.train.plants import HOLDS, Sampler, environment
+from benchmarks.train.plants import HOLD_TIMES, Sampler, environment
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
 from tests.conftest import ROOT
@@ -33,7 +33,10 @@ from tests.conftest import ROOT
 SMALL = Training(steps=2, plants=4, segment=60, nodes=3, hidden=2, validation_episodes=2)
 RECIPE = replace(
     ppo.RECIPES["ppo"],
-    plants=((8, {"setpoint": "random"}), (16, {"setpoint": "random", "noise_variance": 0.5})),
+    plants=(
+        ppo.TrainingPlants(8, {"setpoint": "random"}),
+        ppo.TrainingPlants(16, {"setpoint": "random", "noise_variance": 0.5}),
+    ),
     cases={"short": {"max_episode_steps": 20}},
     hidden=(8,),
     memory=40,
@@ -60,7 +63,7 @@ class TestExpectedError:
         assert expected.item() == pytest.approx(errors[reached].mean().item(), rel=0.03)
 
     def test_changes_have_the_chance_that_the_environment_gives_them(self):
-        lengths = np.arange(HOLDS[0], HOLDS[1] + 1)
+        lengths = np.arange(HOLD_TIMES[0], HOLD_TIMES[1] + 1)
         for age, samples in ((0, 19), (85, 19), (150, 25), (270, 19), (299, 13)):
             left = lengths[lengths > age]
             share = (left <= age + samples).mean()
@@ -91,7 +94,7 @@ class TestSampler:
         changes = (batch.setpoints.diff(dim=0) != 0.0).nonzero()
         for plant in range(100):
             times = changes[changes[:, 1] == plant, 0]
-            assert (times.diff() > HOLDS[1]).all()
+            assert (times.diff() > HOLD_TIMES[1]).all()
 
 
 def test_a_seed_gives_a_network_that_differs_from_that_of_another():
@@ -121,7 +124,10 @@ def test_the_command_lists_trainings_by_their_seeds(
     network, steps, files, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setitem(neural.RECIPES, "neural", SMALL)
-    short = {"plants": ((64, {}),), "cases": {"short": {"max_episode_steps": 20}}}
+    short = {
+        "plants": (ppo.TrainingPlants(64, {}),),
+        "cases": {"short": {"max_episode_steps": 20}},
+    }
     monkeypatch.setitem(ppo.RECIPES, "ppo", replace(ppo.RECIPES["ppo"], **short))
     arguments = [network, "--networks", "2", "--steps", str(steps), "--jobs", "1"]
     assert program.main([*arguments, "--out", str(tmp_path)]) == 0
@@ -250,7 +256,7 @@ class TestOtherPlants:
         assert ppo.for_plant({}).plants == ppo.RECIPES["ppo"].plants
 
     def test_what_is_trained_is_run_by_compare_on_this_plant(self, tmp_path, monkeypatch):
-        short = replace(ppo.RECIPES["ppo"], plants=((8, {}), (8, {})))
+        short = replace(ppo.RECIPES["ppo"], plants=(ppo.TrainingPlants(8, {}),) * 2)
         monkeypatch.setitem(ppo.RECIPES, "ppo", short)
         given = "ppo --networks 2 --steps 8 --jobs 1 --set b=[0.0456,0.00404] --set u_max=12"
         assert program.main([*given.split(), "--out", str(tmp_path)]) == 0

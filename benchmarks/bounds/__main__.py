@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from benchmarks.lib.command import Count, FanOut, Runs, Seed, command, options
+from benchmarks.lib.command import Count, Runs, Seed, command, options
 from benchmarks.lib.errors import NoBoundError
+from benchmarks.lib.parallel import FanOut
 from benchmarks.lib.provenance import ROOT, commit, versions
 from benchmarks.lib.storage import write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions, Scenario

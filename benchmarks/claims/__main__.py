@@ -5,7 +5,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.lib.command import FanOut, Folder, Names, Runs, command, known, options
+from benchmarks.lib.command import Folder, Names, Runs, command, known, options
+from benchmarks.lib.parallel import FanOut
 from benchmarks.lib.provenance import origin
 from benchmarks.lib.results import results_folder
 from benchmarks.lib.storage import write_csv

@@ -62,8 +62,8 @@ PAIRED = (
 )
 HARD = (
     "The mean error on the preset hard, in °C, is the sum of three contributions: those of the "
-    f"first {START_SAMPLES} samples of a run, of the {RESPONSE_SAMPLES} samples after each later change of the "
-    "set point, and of the remaining samples."
+    f"first {START_SAMPLES} samples of a run, of the {RESPONSE_SAMPLES} samples after each "
+    "later change of the set point, and of the remaining samples."
 )
 COSTS = (
     "The column 'prior knowledge' says what a controller knows about the plant before a run, "

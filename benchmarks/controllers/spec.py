@@ -49,7 +49,7 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
     runs
         Number of runs in a batch.
     seed
-        Seed of the first run; run i uses the seed `seed + i`.
+        Seed of the controller's random numbers in the first run; run i uses `seed + i`.
     """
     values: dict[str, Any] = {"parameters": plant, "num_envs": runs, "seed": seed}
     values["u_min"] = plant.range_of("u_min")[0]
@@ -118,8 +118,8 @@ class ControllerSpec:
         What was searched or trained beforehand, and in how many trials and samples, in words.
     tuned_by : str
         The argument of `build`, a time constant in s, that is chosen such that the loop with
-        the nominal plant has a maximum sensitivity of `sensitivity`. "" if no argument is
-        chosen in this way.
+        the nominal plant has a maximum sensitivity of `sensitivity`. The text is "" if the
+        controller has no such argument.
     sensitivity : float
         Ms, the largest magnitude of the sensitivity function of the loop.
     linear : bool
@@ -182,10 +182,10 @@ class ControllerSpec:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def members(self) -> "list[ControllerSpec]":
-        """Return a record for each network of the controller, in the order of the files' names.
+        """Return a record for each trained network, in the order of the files' names.
 
-        Each of the records builds the controller with one network. If the controller has no
-        networks, the list consists of this record.
+        Each record builds the controller with one network. If the controller has no networks,
+        the list consists of this record.
         """
         if self.networks is None:
             return [self]
@@ -202,35 +202,34 @@ class ControllerSpec:
         return members
 
     def with_few_networks(self) -> "ControllerSpec":
-        """Return the record with only the first network, or this record if networks differ.
+        """Return a record with the first network only, if the networks are alike.
 
-        A controller whose `networks_are_alike` is false keeps all networks.
+        A controller whose networks are not alike, or that has none, keeps its record.
         """
         networks = self.networks
         if networks is None or not self.networks_are_alike:
             return self
-        return replace(self, networks=lambda: dict(sorted(networks().items())[:1]))
+
+        def first_network() -> dict[str, Any]:
+            file, network = min(networks().items())
+            return {file: network}
+
+        return replace(self, networks=first_network)
 
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
-        """Return a record whose `build` always gets the arguments `gains`.
+        """Return a record of the controller with fixed gains.
 
-        `gains` are arguments by name. If the time constant `tuned_by` is among the gains, the
-        value in `gains` replaces the value that `robust_time_constant` would choose.
+        `gains` has arguments of `build` by name. If the argument `tuned_by` is among the
+        gains, `robust_time_constant` does not choose its value any more.
         """
         tuned_by = "" if self.tuned_by in gains else self.tuned_by
         return replace(self, build=partial(self.build, **gains), tuned_by=tuned_by)
 
     def make(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller for a batch of runs.
+        """Return a controller for a batch of `runs` runs.
 
-        Parameters
-        ----------
-        plant
-            The environment's arguments, from which the controller's prior knowledge follows.
-        runs
-            Number of runs in the batch.
-        seed
-            Seed of the controller's random numbers: run i uses the seed `seed + i`.
+        The controller's prior knowledge is that of `plant`, the environment's arguments. The
+        controller draws random numbers for run i with the seed `seed + i`.
         """
         parameters = Parameters(**{**plant, **self.observation})
         arguments = knowledge(self.prior_knowledge, parameters, runs, seed)
@@ -251,6 +250,7 @@ class ControllerSpec:
         def build(time_constant: float) -> Any:
             return self.build(**arguments, **{self.tuned_by: time_constant})
 
+        # The search covers all useful time constants between these two.
         slowest = 30.0 * (arguments["time_constant"] + arguments["delay"])
         fastest = 0.1 * arguments["sampling_interval"]
         model = nominal(parameters)
@@ -258,9 +258,9 @@ class ControllerSpec:
         return float(f"{exact:.4g}")
 
     def loop(self, plant: Mapping[str, Any]) -> LinearLoop:
-        """Return the loop of this linear controller with the nominal plant.
+        """Return the loop of this controller, which must be linear, with the nominal plant.
 
-        `plant` has the environment's arguments. The record must have `linear` true.
+        `plant` has the environment's arguments.
         """
         controller: Any = self.make(plant, 1, 0)
         return LinearLoop.of(controller, nominal(Parameters(**plant)))
@@ -268,18 +268,17 @@ class ControllerSpec:
     def misfit(self, plant: Parameters) -> str:
         """Return a sentence that says why the controller does not fit a plant; "" if it fits.
 
-        A controller fits if `plant` agrees with the plant `made_for` in all that the controller
-        `assumes`. If a controller does not fit the plant, the error does not show how good the
-        controller is.
+        A controller fits a plant that agrees with the plant `made_for` in all that the
+        controller `assumes`.
         """
         made_for = Parameters(**self.made_for)
-        direction = plant_scale.direction(plant)
-        expected_direction = plant_scale.direction(made_for)
-        if "direction" in self.assumes and direction != expected_direction:
-            sign = {1: "positive", -1: "negative"}
+        signs = {1: "positive", -1: "negative"}
+        sign = signs[plant_scale.direction(plant)]
+        expected_sign = signs[plant_scale.direction(made_for)]
+        if "direction" in self.assumes and sign != expected_sign:
             return (
-                f"{self.label} was made for a plant of {sign[expected_direction]} gain. This "
-                f"plant has a {sign[direction]} gain, so the loop runs in positive feedback."
+                f"{self.label} was made for a plant of {expected_sign} gain. This plant has a "
+                f"{sign} gain, so the loop runs in positive feedback."
             )
         if "scale" in self.assumes:
             difference = plant_scale.difference(plant, made_for)
@@ -313,26 +312,15 @@ class ControllerSpec:
             default, a new one is made for `plant`.
         """
         agent = controller or self.make(plant, runs, seed)
-        arguments = {**plant, **self.observation}
-        if hasattr(agent, "opened"):  # A user's policy acts in an environment of its own.
-            with agent.opened(samples, **arguments) as plants:
-                return rollout(plants, agent, samples, seed)
-        return rollout(make_plants(runs, samples, **arguments), agent, samples, seed)
+        plants = make_plants(runs, samples, **{**plant, **self.observation})
+        return rollout(plants, agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller for a batch of runs, after it has learnt if it can learn.
+        """Make a controller for a batch of `runs` runs, let it learn if it can, and return it.
 
-        A controller that learns runs `LEARNING` samples of the square wave on the plant before
-        it is returned.
-
-        Parameters
-        ----------
-        plant
-            The environment's arguments.
-        runs
-            Number of runs in the batch.
-        seed
-            Seed of the controller's random numbers: run i uses the seed `seed + i`.
+        Learning takes `LEARNING` samples of the square wave on the plant with the environment's
+        arguments `plant`. The controller draws random numbers for run i with the seed
+        `seed + i`.
         """
         controller = self.make(plant, runs, seed)
         if self.learns:

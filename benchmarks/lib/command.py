@@ -1,11 +1,10 @@
-"""Declare and run the commands `python -m benchmarks.NAME`, and run their tasks in parallel.
+"""Make the command `python -m benchmarks.NAME` from a dataclass of options and a function.
 
-The code of the command NAME is the file `benchmarks/NAME.py`, or a folder `benchmarks/NAME`
-with a `__main__.py`. The code of a command defines a dataclass `Options`, whose docstrings are
-the text of `--help`, and a function `work`. The function `work` takes an instance of `Options`,
-writes the results and returns the last line to print. Packages that are slow to import are
-imported within `work`, so that `--help` is quick. The line
-`main = command("NAME", Options, work)` makes the command.
+The module of a command defines a dataclass `Options` and a function `work`. The docstrings of
+`Options` are the text of `--help`. The function `work` takes an instance of `Options`, writes
+the results and returns the last line to print. Packages that are slow to import are imported
+within `work`, so that `--help` is quick. The line `main = command("NAME", Options, work)` makes
+the command.
 """
 
 import errno
@@ -15,117 +14,65 @@ import os
 import shlex
 import signal
 import sys
-import threading
-import time
-import traceback
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar
 
-from benchmarks.lib.errors import UnfinishedError, UsageError
-from benchmarks.lib.provenance import COMMAND_LINE, ROOT
-from benchmarks.lib.results import KeptResults
-
-# The extra of this project, as in `pip install -e ".[EXTRA]"`, that installs each package.
-EXTRAS = {
-    **dict.fromkeys(("cyclopts", "filelock", "joblib", "matplotlib", "pandas"), "compare"),
-    **dict.fromkeys(("rich", "scipy", "tabulate"), "compare"),
-    **dict.fromkeys(("optuna", "PIL", "pygame", "stable_baselines3"), "bench"),
-    **dict.fromkeys(("h5py", "minari"), "data"),
-    "ray": "ray",
-    "torch": "torch",
-}
-# System errors after which nothing more can be written: the disk is full, the quota or the
-# largest size of a file is exceeded, or the reader of a pipe has ended.
-NOTHING_WRITABLE = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EPIPE
-
-
-def stop(error: BaseException, program: str = "python -m benchmarks") -> NoReturn:
-    """Print the message of an error, without a traceback, and end this process with status 2.
-
-    Parameters
-    ----------
-    error
-        The error. For an `ImportError` of a missing package in `EXTRAS`, the message names the
-        extra that installs the package. Any other `ImportError` is a bug, and is raised again.
-    program
-        The command, such as "python -m benchmarks.compare", which begins the message.
-    """
-    message = str(error)
-    cause = error.__cause__ or error
-    package = str(getattr(cause, "name", "")).partition(".")[0]
-    if package in EXTRAS:
-        extra = EXTRAS[package]
-        message = f'{package} is not installed: pip install -e ".[{extra}]" ({cause})'
-    elif isinstance(error, ImportError):
-        raise error
-    print(f"{program}: error: {message}", file=sys.stderr)
-    raise SystemExit(2) from error
-
+from benchmarks.lib.errors import UnfinishedError, UsageError, stop
+from benchmarks.lib.provenance import COMMAND_LINE
 
 try:
     from cyclopts import App, CycloptsError
     from cyclopts import Parameter as Parameter  # The commands import it from this module.
     from cyclopts.validators import Number
-except ImportError as _missing:
-    stop(_missing)
+except ImportError as error:
+    stop("python -m benchmarks", error)
 
-Group = TypeVar("Group")  # a dataclass whose fields are options of a command
+Declared = TypeVar("Declared")  # a dataclass whose fields are options of a command
 
 # A decorator of dataclasses: the fields become options of a command, `--field VALUE`, also if
 # the dataclass is the type of a field of another dataclass.
-options: Callable[[type[Group]], type[Group]] = Parameter(name="*")
+options: Callable[[type[Declared]], type[Declared]] = Parameter(name="*")
+
+# System errors after which nothing more can be written: the disk is full, the quota or the
+# largest size of a file is exceeded, or the reader of a pipe has ended.
+DISK_FULL_OR_PIPE_CLOSED = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EPIPE
 
 
-def _whole_number(_type: object, tokens: Sequence[Any]) -> int:
-    """Convert the text that a user typed to an integer, for cyclopts.
+def _to_integer(_type: object, tokens: Sequence[Any]) -> int:
+    """Return the word that a user typed, `tokens[0].value`, as an integer.
 
-    The text is `tokens[0].value`. A ValueError is raised if the text is not a whole number;
-    cyclopts without this converter would turn 2.5 into 2.
+    A ValueError is raised if the word is not a whole number. Without this converter, cyclopts
+    would read 2.5 as 2.
     """
-    typed = tokens[0].value
+    word = tokens[0].value
     try:
-        return int(typed)
+        return int(word)
     except ValueError as error:
-        raise ValueError(f"must be a whole number, got {typed}") from error
-
-
-def _folder(_type: object, tokens: Sequence[Any]) -> Path:
-    """Convert the text that a user typed to the path of a folder, for cyclopts.
-
-    The text is `tokens[0].value`. A ValueError is raised if the text is empty; cyclopts without
-    this converter would turn "" into the current folder.
-    """
-    if not tokens[0].value:
-        raise ValueError("must name a folder")
-    return Path(tokens[0].value)
+        raise ValueError(f"must be a whole number, got {word}") from error
 
 
 def _integers(least: int, most: int) -> Parameter:
     """Return an annotation of an option that accepts integers from `least` to `most` only."""
     allowed = Number(gte=least, lte=most)
-    return Parameter(converter=_whole_number, n_tokens=1, validator=allowed)
+    return Parameter(converter=_to_integer, n_tokens=1, validator=allowed)
 
 
-# Types of options, with limits that no useful value exceeds.
+# Types of options. No useful value exceeds the limits of the numbers.
 Count = Annotated[int, _integers(1, 1_000_000_000)]
 Runs = Annotated[int, _integers(1, 100_000)]
 Seed = Annotated[int, _integers(0, 2**63)]
 Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
-Folder = Annotated[
-    Path, Parameter(help="The folder to write to.", converter=_folder, n_tokens=1)
-]
+Folder = Annotated[Path, Parameter(help="The folder to write to.")]
 
 
 @contextmanager
 def blame(option: str) -> Iterator[None]:
     """Turn a ValueError in the block of a `with` statement into a `UsageError`.
 
-    The message begins with `option`, the name of an option such as "--agent".
+    The message begins with `option`, the name of an option such as "--device".
     """
     try:
         yield
@@ -156,20 +103,11 @@ def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[st
     return list(dict.fromkeys(listed))
 
 
-def _default_as_typed(default: object) -> str | None:
-    """Return the default of an option as a user would type it, for the text of `--help`.
-
-    The result is None if the help is not to show a default: for None, False and ().
-    """
-    if default is None or default is False or default == ():
-        return None
-    if isinstance(default, tuple):
-        return " ".join(map(str, default))
-    return str(default)
-
-
-def read(declared: type[Group], program: str, words: Sequence[str]) -> Group | None:
+def read(declared: type[Declared], program: str, words: Sequence[str]) -> Declared | None:
     """Convert the words of a command line to options, or print the help after `--help`.
+
+    The result is an instance of the dataclass `declared`, or None if the help was printed. A
+    `UsageError` is raised if an option is unknown or has an invalid value.
 
     Parameters
     ----------
@@ -179,24 +117,13 @@ def read(declared: type[Group], program: str, words: Sequence[str]) -> Group | N
         The command, such as "python -m benchmarks.compare", for the help.
     words
         The words of the command line after the command.
-
-    Returns
-    -------
-    object or None
-        An instance of `declared`; None if the help was printed.
-
-    Raises
-    ------
-    UsageError
-        If an option is unknown or has an invalid value.
     """
+    defaults = Parameter(negative=(), allow_repeating=True, show_default=_as_typed)
     app = App(
         name=program,
         help=inspect.getdoc(declared),
         version_flags=[],
-        default_parameter=Parameter(
-            negative=(), allow_repeating=True, show_default=_default_as_typed
-        ),
+        default_parameter=defaults,
         result_action="return_value",
     )
     app["--help"].show = False
@@ -204,18 +131,32 @@ def read(declared: type[Group], program: str, words: Sequence[str]) -> Group | N
     try:
         chosen = app(list(words), exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        raise UsageError(" ".join(str(error).split())) from error
+        one_line = " ".join(str(error).split())
+        raise UsageError(one_line) from error
     return chosen if isinstance(chosen, declared) else None
 
 
+def _as_typed(default: object) -> str | None:
+    """Return the default of an option as a user would type it, for the text of `--help`.
+
+    The result is None, and the help shows no default, for an option that is off or empty by
+    default.
+    """
+    if default is None or default is False or default == ():
+        return None
+    if isinstance(default, tuple):
+        return " ".join(default)
+    return str(default)
+
+
 def command(
-    name: str, declared: type[Group], work: Callable[[Group], str]
+    name: str, declared: type[Declared], work: Callable[[Declared], str]
 ) -> Callable[..., int]:
     """Return the function `main` of the command `python -m benchmarks.NAME`.
 
-    `main(arguments)` takes the words of a command line after the command, by default the words
-    with which this process was started. The function `main` reads the options, calls `work`,
-    and returns the exit status of the command, as `finish` does.
+    `main(words)` takes the words of a command line after the command, by default the words with
+    which this process was started. The function `main` reads the options, calls `work`, and
+    returns the exit status of the command, as `run_program` does.
 
     Parameters
     ----------
@@ -228,49 +169,54 @@ def command(
     """
     program = f"python -m benchmarks.{name}"
 
-    def main(arguments: Sequence[str] | None = None) -> int:
-        words = sys.argv[1:] if arguments is None else list(arguments)
-        if arguments is None:  # This process runs the command alone.
+    def main(words: Sequence[str] | None = None) -> int:
+        if words is None:  # This process runs nothing but the command.
+            words = sys.argv[1:]
             _interrupt_on_signals()
 
         def read_and_work() -> str:
             chosen = read(declared, program, words)
             return "" if chosen is None else work(chosen)
 
-        token = COMMAND_LINE.set(shlex.join([*program.split(), *words]))
+        earlier = COMMAND_LINE.set(shlex.join([*program.split(), *words]))
         try:
-            return finish(read_and_work, program)
+            return run_program(program, read_and_work)
         finally:
-            COMMAND_LINE.reset(token)
+            COMMAND_LINE.reset(earlier)
 
     return main
 
 
-def finish(work: Callable[[], str], program: str) -> int:
+def run_program(program: str, work: Callable[[], str]) -> int:
     """Call `work`, print the line that it returns, and return the exit status of a command.
 
-    The status is 0 for success; 1 if tasks failed, memory ran out, or nothing more could be
-    written; 130 after Ctrl-C and 143 after SIGTERM. After a `UsageError`, or if a package is
-    missing, this process ends with status 2. `program` is the command, such as
-    "python -m benchmarks.compare", which begins the error messages.
+    The status is 0 for success; 1 if tasks failed or nothing more could be written; 130 after
+    Ctrl-C; and 143 after SIGTERM. After a `UsageError`, or if a package is missing, this
+    process ends with status 2.
+
+    Parameters
+    ----------
+    program
+        The command, such as "python -m benchmarks.compare", which begins error messages.
+    work
+        Does the work, and returns the last line to print, or "".
     """
     try:
-        closing_line = work()
-        if closing_line:
-            print(closing_line, flush=True)
+        last_line = work()
+        if last_line:
+            print(last_line, flush=True)
         return 0
+    except (UsageError, ImportError) as error:
+        stop(program, error)
     except KeyboardInterrupt as interrupt:
         print("\nInterrupted.", flush=True)
+        # Without a handler of this module, Python does not say which signal it was.
         number = interrupt.args[0] if interrupt.args else signal.SIGINT
         return 128 + int(number)
     except UnfinishedError as error:
         print(error)
-    except MemoryError:
-        print("There is not enough memory for so many runs or samples.")
-    except (UsageError, ImportError) as error:
-        stop(error, program)
     except OSError as error:
-        if error.errno not in NOTHING_WRITABLE:
+        if error.errno not in DISK_FULL_OR_PIPE_CLOSED:
             raise
         print(f"{program}: nothing more can be written: {error.strerror}", file=sys.stderr)
         # Python writes the rest of its output at exit, which would raise the error again.
@@ -281,235 +227,19 @@ def finish(work: Callable[[], str], program: str) -> int:
 def _interrupt_on_signals() -> None:
     """Make the first Ctrl-C or SIGTERM raise a KeyboardInterrupt in this process.
 
-    The number of the signal is the argument of the KeyboardInterrupt. After the first signal,
-    Ctrl-C and SIGTERM are ignored, so that the command can write its finished results. A signal
-    that this process ignored when it was started, as with `nohup`, stays ignored.
+    A signal that this process has ignored since its start stays ignored: a shell starts
+    commands in the background with Ctrl-C ignored.
     """
-    signals = [
-        number
-        for number in (signal.SIGINT, signal.SIGTERM)
-        if signal.getsignal(number) is not signal.SIG_IGN
-    ]
-
-    def interrupt(number: int, _frame: object) -> NoReturn:
-        for later in signals:
-            signal.signal(later, signal.SIG_IGN)
-        raise KeyboardInterrupt(number)
-
-    for number in signals:
-        signal.signal(number, interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _interrupt)
 
 
-Task = Callable[[], Any]  # a part of a command's work that can run in another process
+def _interrupt(number: int, _frame: object) -> NoReturn:
+    """Raise a KeyboardInterrupt whose argument is the signal `number`.
 
-
-class Answer(NamedTuple):
-    """The outcome of a task that has ended."""
-
-    task: str  # the name of the task
-    result: Any  # what the task returned; None if the task failed
-    error: str  # the message or traceback of a task that failed; "" after success
-
-
-@options
-@dataclass(frozen=True, kw_only=True)
-class FanOut:
-    """The options that say how many tasks run at once, and where joblib runs the tasks.
-
-    With `--jobs 1`, tasks run in this process. The result of a task does not depend on these
-    two options if all random numbers of the task come from seeds in its arguments.
+    Later signals are ignored, so that the command can write its finished results.
     """
-
-    jobs: Count | None = None
-    """The number of tasks that run at once (default: one per core)."""
-    backend: Literal["loky", "ray"] = "loky"
-    """Where tasks run: loky is this machine, and ray is the Ray cluster at RAY_ADDRESS."""
-
-    def stream(
-        self, tasks: Mapping[str, Task], title: str = "", store: KeptResults | None = None
-    ) -> Iterator[tuple[str, Any]]:
-        """Run tasks, and yield the name and the result of each task that has succeeded.
-
-        A result is yielded as soon as the task has finished, in any order. On a Ray cluster,
-        all results are yielded at the end.
-
-        Parameters
-        ----------
-        tasks
-            The tasks by name: functions without arguments that can be pickled, such as a
-            `functools.partial` of a function of a module.
-        title
-            Title of the progress bar; "" for no progress bar.
-        store
-            Stored results. A task whose result is stored is not run: its result is yielded
-            before all others. The results of tasks that run are added to the store.
-
-        Raises
-        ------
-        UnfinishedError
-            At the end, if tasks failed. The message names the failed tasks and their errors.
-        """
-        missing: dict[str, Task] = {}
-        errors: dict[str, str] = {}
-        with progress_bar(title, len(tasks)) as advance:
-            for name, task in tasks.items():
-                result = store.load(name) if store else None
-                if result is None:
-                    missing[name] = task
-                    continue
-                advance()
-                yield name, result
-            for answer in self._answers(missing):
-                advance()
-                if answer.error:
-                    errors[answer.task] = answer.error
-                    continue
-                if store:
-                    store.save(answer.task, answer.result)
-                yield answer.task, answer.result
-        if errors:
-            raise UnfinishedError(_summary(errors, len(tasks)))
-
-    def _answers(self, tasks: Mapping[str, Task]) -> Iterator[Answer]:
-        """Run tasks, and yield the outcome of a task when the task has ended, in any order.
-
-        `tasks` are as in `stream`. An `UnfinishedError` is raised if the system killed a
-        process that ran tasks; failed tasks raise nothing.
-        """
-        import joblib  # imported here, as it is slow to import
-
-        calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
-        if self.backend == "ray":
-            _connect_to_ray()
-            with joblib.parallel_config("ray", n_jobs=self.jobs or -1):
-                yield from joblib.Parallel()(calls)
-            return
-        jobs = max(1, min(self.jobs or joblib.cpu_count(), len(calls)))
-        with joblib.parallel_config(
-            "loky",
-            inner_max_num_threads=1,
-            initializer=_prepare_worker,
-            initargs=(os.getpid(),),
-        ):
-            parallel = joblib.Parallel(jobs, return_as="generator_unordered", batch_size=1)
-        try:
-            with _ctrl_c_ignored():  # The processes that start here ignore Ctrl-C, too.
-                answers = parallel(calls)
-            yield from answers
-        except BrokenProcessPool as error:
-            raise UnfinishedError(
-                "a process was killed, perhaps because memory ran out: try fewer --jobs"
-            ) from error
-
-
-@contextmanager
-def _ctrl_c_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C in this process during the block of a `with` statement.
-
-    In a thread other than the main thread, nothing is done, since Python lets no other thread
-    change how signals are handled.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
-
-
-def _attempt(name: str, task: Task) -> Answer:
-    """Run the task called `name` in a worker process, and return the outcome of the task.
-
-    If the task raises an error, the outcome has the error as text, since not every exception
-    can be pickled.
-    """
-    try:
-        return Answer(name, task(), "")
-    except UsageError as error:  # The message is for the user, who needs no traceback.
-        return Answer(name, None, str(error))
-    except (Exception, SystemExit):
-        return Answer(name, None, traceback.format_exc().strip())
-
-
-def _summary(errors: Mapping[str, str], tasks: int) -> str:
-    """Return the message of the `UnfinishedError` for failed tasks.
-
-    The message has the last line of the error of each failed task, of at most 20 tasks, and
-    then all lines of the first error.
-
-    Parameters
-    ----------
-    errors
-        The message or traceback of each failed task, by the name of the task.
-    tasks
-        The number of all tasks, with those that succeeded.
-    """
-    lines = [f"{len(errors)} of {tasks} tasks failed; the other tasks have finished"]
-    for name, text in list(errors.items())[:20]:
-        lines.append(f"{name}: {text.splitlines()[-1]}")
-    lines.append(next(iter(errors.values())))
-    return "\n".join(lines)
-
-
-def _prepare_worker(parent: int) -> None:
-    """Make this worker process ignore Ctrl-C, and end when its parent process has ended.
-
-    joblib calls this function at the start of each worker process. `parent` is the process
-    identifier of the parent. A terminal sends Ctrl-C to the parent and to all workers; the
-    parent then ends the workers.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def end_with_parent() -> None:
-        while os.getppid() == parent:
-            time.sleep(1.0)
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-@contextmanager
-def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show a progress bar during the block of a `with` statement.
-
-    The block calls the yielded function, without arguments, each time a task has finished.
-    `total` is the number of tasks. The bar is hidden if `title` is "" or if the standard error
-    stream is not a terminal.
-    """
-    from rich.console import Console
-    from rich.progress import Progress
-
-    hidden = not (title and sys.stderr.isatty())
-    with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:
-        bar = progress.add_task(title, total=total)
-        yield lambda: progress.advance(bar)
-
-
-def _connect_to_ray() -> None:
-    """Connect this process to a Ray cluster, and make "ray" a backend of joblib.
-
-    The environment variable RAY_ADDRESS has the address of the cluster; by default, a cluster
-    on this machine is looked for. Ray copies the code of the checkout to the nodes of the
-    cluster. A `UsageError` is raised if no cluster can be reached.
-    """
-    import ray  # imported here, as it is optional and slow to import
-    from ray.util.joblib import register_ray
-
-    register_ray()
-    # The tasks need the code alone: the patterns with "!" make exceptions from the first one.
-    excluded = ["/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py"]
-    excluded += ["published", "*.md"]
-    try:
-        ray.init(
-            address=os.environ.get("RAY_ADDRESS", "auto"),
-            runtime_env={"working_dir": str(ROOT), "excludes": excluded},
-            ignore_reinit_error=True,
-            log_to_driver=False,
-        )
-    except (OSError, RuntimeError, ValueError) as error:
-        raise UsageError(
-            "--backend: no Ray cluster can be reached: start one with `ray start --head`, or "
-            f"set RAY_ADDRESS ({error})"
-        ) from error
+    for later in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(later, signal.SIG_IGN)
+    raise KeyboardInterrupt(number)

@@ -51,12 +51,12 @@ def versions() -> dict[str, str]:
 
 @cache
 def commit() -> str:
-    """Return the hash of the checked-out git commit, 40 digits.
+    """Return the hash of the git commit of the checkout, 40 digits.
 
     If files of the checkout differ from the commit, "-dirty" follows the hash. If git is not
     installed or the checkout is not a git repository, the result is "".
     """
-    if not (ROOT / ".git").exists():  # git would look for a repository around it.
+    if not (ROOT / ".git").exists():  # git would look around the checkout.
         return ""
     command = ["git", "status", "--porcelain=v2", "--branch"]
     try:

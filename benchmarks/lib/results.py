@@ -8,8 +8,6 @@ the command stays beside a new report. In this module, a run is one execution of
 import hashlib
 import json
 import shutil
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
@@ -40,8 +38,7 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
     Parameters
     ----------
     target
-        The folder that the user has chosen by `--out`. If `target` has files that no earlier
-        run wrote, a `UsageError` is raised, and nothing is removed.
+        The folder that the user has chosen by `--out`.
     conditions
         All that the results depend on, as `conditions_of` returns it. If an unfinished run with
         equal conditions has left its folder, this folder is yielded, with the files in it.
@@ -50,37 +47,42 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
     Raises
     ------
     UsageError
-        If `target` cannot be written to, if another process is writing to `target`, or if
-        `target` or the yielded folder has files that no run wrote.
+        If `target` holds the current folder or cannot be written to, if another process is
+        writing to `target`, or if `target` or the yielded folder has files that no run wrote.
     UnfinishedError
         If the yielded folder cannot be renamed to `target` at the end.
     """
-    place = target.resolve()
-    if not place.name:
-        raise UsageError(f"--out: {target} is the root of a file system: choose a folder in it")
-    out_folder(place.parent)
-    unfinished = place.with_name(f"{place.name}.unfinished")
-    _refuse_other_files(place)
-    with _lock(place):
+    final = target.resolve()
+    if Path.cwd().is_relative_to(final):
+        raise UsageError(f"--out: {target} must not be the current folder or a folder above it")
+    out_folder(final.parent)
+    unfinished = final.with_name(f"{final.name}.unfinished")
+    _refuse_other_files(final)
+    with _lock(final):
         _prepare(unfinished, conditions)
         try:
             yield unfinished
         except BaseException:
-            _keep_or_remove(unfinished, conditions)
+            if _files(unfinished) == [RECORD]:
+                shutil.rmtree(unfinished)
+                raise
+            print(f"\nThe run has not finished. Its results so far are in {unfinished}/.")
+            if conditions:
+                print("The same command continues with them.")
             raise
         try:
-            _finish(unfinished, place)
+            _replace(final, unfinished)
         except (OSError, UsageError) as error:
             raise UnfinishedError(
-                f"{place} could not be replaced: {error}; the results are in {unfinished}/"
+                f"{final} could not be replaced: {error}; the results are in {unfinished}/"
             ) from error
 
 
-def _lock(place: Path) -> AbstractContextManager[object]:
-    """Return a lock on a folder of results, which the end of a `with` block releases.
+def _lock(final: Path) -> AbstractContextManager[object]:
+    """Lock the folder `final`, and return a context whose end unlocks the folder.
 
-    The folder `place` need not exist: the lock is a hidden file beside the folder. The
-    operating system releases the lock if this process is killed.
+    The folder need not exist: the lock is a hidden file beside the folder. The operating system
+    unlocks the folder if this process is killed.
 
     Raises
     ------
@@ -90,10 +92,10 @@ def _lock(place: Path) -> AbstractContextManager[object]:
     from filelock import FileLock, Timeout  # imported here, as --help needs no lock
 
     try:
-        return FileLock(place.with_name(f".{place.name}.lock")).acquire(timeout=0)
+        return FileLock(final.with_name(f".{final.name}.lock")).acquire(timeout=0)
     except Timeout as error:
         raise UsageError(
-            f"--out: another run writes to {place}: wait for it, or choose another folder"
+            f"--out: another run writes to {final}: wait for it, or choose another folder"
         ) from error
 
 
@@ -120,72 +122,63 @@ def _record(folder: Path) -> dict[str, Any]:
     return record
 
 
-def _refuse_other_files(place: Path) -> None:
-    """Raise a `UsageError` if the folder `place` has files that no finished run has recorded.
+def _refuse_other_files(final: Path) -> None:
+    """Raise a `UsageError` if the folder `final` has files that no finished run has recorded.
 
     So a command never replaces a folder with files of the user.
     """
-    if place.exists() and not place.is_dir():
-        raise UsageError(f"--out: {place} cannot be written to: it is not a folder")
-    written = {RECORD, *_record(place).get("files", [])}
-    foreign = [name for name in _files(place) if name not in written]
-    if foreign:
-        listed = ", ".join(foreign[:3])
+    if final.exists() and not final.is_dir():
+        raise UsageError(f"--out: {final} cannot be written to: it is not a folder")
+    recorded = {RECORD, *_record(final).get("files", [])}
+    others = [name for name in _files(final) if name not in recorded]
+    if others:
+        listed = ", ".join(others[:3])
         raise UsageError(
-            f"--out: {place} holds files that this version did not write ({listed}): remove "
+            f"--out: {final} holds files that this version did not write ({listed}): remove "
             "the folder, or choose another one"
         )
 
 
 def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
-    """Prepare the folder that `results_folder` yields.
+    """Prepare the folder `unfinished`, which `results_folder` yields.
 
-    If an unfinished run with equal `conditions` has left the folder `unfinished`, the folder
-    stays as it is. Otherwise, and if `conditions` is None, the folder becomes empty except for
-    the file `RECORD`. A `UsageError` is raised if the folder has files but no valid `RECORD`.
+    If a run with equal `conditions` has left the folder, the folder stays as it is. Otherwise,
+    and if `conditions` is None, the folder becomes empty except for the file `RECORD`.
+
+    Raises
+    ------
+    UsageError
+        If the folder has files but no valid `RECORD`, so that no run has written the files.
     """
     record = _record(unfinished)
-    is_in_use = bool(_files(unfinished))
-    if is_in_use and not record:
+    has_files = bool(_files(unfinished))
+    if has_files and not record:
         raise UsageError(f"--out: {unfinished} holds files that no run wrote: remove it")
     if conditions and record.get("conditions") == conditions:
         print(f"The run continues with the results in {unfinished}/", flush=True)
         return
-    if conditions and is_in_use:
+    if conditions and has_files:
         print(f"The results in {unfinished}/ are of other options, code or packages.")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir()
     write_json(unfinished / RECORD, {"command": COMMAND_LINE.get(), "conditions": conditions})
 
 
-def _keep_or_remove(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
-    """Print where the results of an interrupted run are, or remove the folder of the run.
+def _replace(final: Path, unfinished: Path) -> None:
+    """Replace the folder `final` by the folder `unfinished` of a run that has finished.
 
-    The folder `unfinished` is removed if it has no results. If there are `conditions`, as
-    `results_folder` describes them, a second line says that the same command continues.
+    The names of the run's files are added to `RECORD`, and the results of single tasks are
+    removed.
     """
-    if _files(unfinished) == [RECORD]:
-        shutil.rmtree(unfinished)
-        return
-    print(f"\nThe run has not finished. Its results so far are in {unfinished}/.", flush=True)
-    if conditions:
-        print("The same command continues with them.", flush=True)
-
-
-def _finish(unfinished: Path, place: Path) -> None:
-    """Write the names of a finished run's files to `RECORD`, and rename the run's folder.
-
-    The folder `unfinished` replaces the folder `place`.
-    """
-    _refuse_other_files(place)  # Somebody may have added files since the run began.
+    _refuse_other_files(final)  # Somebody may have added files since the run began.
     shutil.rmtree(unfinished / TASKS, ignore_errors=True)
     record = {**_record(unfinished), "files": _files(unfinished)}
     write_json(unfinished / RECORD, record)
-    earlier = place.with_name(f".{place.name}.earlier")
+    earlier = final.with_name(f".{final.name}.earlier")
     shutil.rmtree(earlier, ignore_errors=True)
-    if place.exists():
-        place.rename(earlier)
-    unfinished.rename(place)
+    if final.exists():
+        final.rename(earlier)
+    unfinished.rename(final)
     shutil.rmtree(earlier, ignore_errors=True)
 
 
@@ -205,7 +198,7 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
     """
     conditions = {
         "command": command,
-        "options": _relevant(asdict(options)),
+        "options": asdict(options, dict_factory=_relevant),
         "versions": versions(),
         "code": code_hash(),
     }
@@ -213,15 +206,13 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
     return as_read
 
 
-def _relevant(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options by name without those in `IRRELEVANT`, in all nested dicts, too."""
-    relevant = {}
-    for name, value in options.items():
-        if isinstance(value, dict):
-            value = _relevant(value)
-        if name not in IRRELEVANT:
-            relevant[name] = value
-    return relevant
+def _relevant(options: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return pairs of name and value as a dict, without the names in `IRRELEVANT`.
+
+    `dataclasses.asdict` calls this function for the dataclass of options, and for each
+    dataclass in it.
+    """
+    return {name: value for name, value in options if name not in IRRELEVANT}
 
 
 def _content(value: object) -> str:
@@ -243,10 +234,10 @@ def save_arrays(path: Path, result: Mapping[str, Any]) -> None:
 def load_arrays(path: Path) -> dict[str, Any]:
     """Return the numbers and arrays of the NPZ file `path` by name, as saved by `save_arrays`.
 
-    Pickled objects are refused with a ValueError, since loading them could run foreign code.
+    NumPy refuses pickled objects with a ValueError, since loading them could run foreign code.
     """
     result = {}
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+    with np.load(path) as arrays:
         for name, array in arrays.items():
             # A number was saved as an array without dimensions.
             result[name] = array if array.ndim else array.item()
@@ -278,17 +269,17 @@ class KeptResults:
         return self.folder / TASKS / f"{quote(name, safe=' ,')}.npz"
 
     def load(self, name: str) -> Any:
-        """Return the stored result of a task; None if its file is missing or damaged.
-
-        `name` is the name of the task.
-        """
-        try:
-            return self.load_file(self.path(name))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
-            return None
+        """Return the stored result of the task called `name`; None if no result is stored."""
+        path = self.path(name)
+        return self.load_file(path) if path.exists() else None
 
     def save(self, name: str, result: Any) -> None:
-        """Write `result`, the result of the task called `name`, to the file of the task."""
+        """Write `result`, the result of the task called `name`, to the file of the task.
+
+        A run that is killed leaves either the whole file or no file of this name.
+        """
         path = self.path(name)
         path.parent.mkdir(exist_ok=True)
-        self.save_file(path, result)
+        partial = path.with_name("partial.npz")
+        self.save_file(partial, result)
+        partial.replace(path)

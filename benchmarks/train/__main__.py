@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from benchmarks.lib.command import Count, FanOut, Folder, Parameter, command, options
+from benchmarks.lib.command import Count, Folder, Parameter, command, options
 from benchmarks.lib.errors import UsageError
+from benchmarks.lib.parallel import FanOut
 from benchmarks.lib.results import KeptResults, conditions_of, results_folder
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.scenarios import PlantOptions
@@ -23,17 +24,18 @@ NETWORKS = {"neural": "neural", "ppo": "ppo", "ppo-hard": "ppo"}
 class Options:
     """Train the neural controllers: by the gradient through the plant, or by PPO.
 
-    If a training of several networks was stopped, the same command with the same code trains
-    only those that are missing.
+    If a command was stopped before it had trained all networks, the same command with the same
+    code trains the missing networks.
     """
 
     network: Annotated[str, Parameter(choices=NETWORKS)] = field(kw_only=False)
-    """What to train."""
+    """The kind of network to train."""
     networks: Count = 5
-    """Networks to train, each from its own seed. All are compared, none is chosen."""
+    """Number of networks to train, each from another seed; `compare` runs all of them."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     steps: Count | None = None
-    """Optimiser steps or, for PPO, samples of experience (default: as published)."""
+    """Length of a training: steps of the optimiser or, for PPO, samples of experience
+    (default: as published)."""
     out: Folder = Path("results/networks")
     fan_out: FanOut = field(default_factory=FanOut)
 
@@ -46,15 +48,18 @@ def work(options: Options) -> str:
     name = options.network
     module = importlib.import_module(f"benchmarks.train.{NETWORKS[name]}")
     recipe = module.RECIPES[name]
-    recipe = replace(recipe, steps=options.steps or recipe.steps)
-    seeds = range(SEED, SEED + options.networks)
-    train, stem = module.train, name
+    train = module.train
+    stem = name  # of the names of the files
     if options.plant.name:
         if name != "ppo":
             raise UsageError(f"--plant, --preset and --set are for ppo, not for {name}")
         plant = options.plant.arguments()
-        recipe = replace(module.for_plant(plant), steps=recipe.steps)
-        train, stem = partial(module.train, plant=plant), f"{name}-plant"
+        recipe = module.for_plant(plant)
+        train = partial(train, plant=plant)
+        stem = "ppo-plant"
+    if options.steps:
+        recipe = replace(recipe, steps=options.steps)
+    seeds = range(SEED, SEED + options.networks)
     tasks = {f"seed {seed}": partial(train, recipe, seed) for seed in seeds}
     target = options.out / stem
     with results_folder(target, conditions_of("train", options)) as folder:
@@ -62,10 +67,10 @@ def work(options: Options) -> str:
         trained = dict(options.fan_out.stream(tasks, "training", kept))
         networks = {seed: trained[f"seed {seed}"] for seed in seeds}
         show_validation(networks)
-        files = {f"{stem}-{seed}": network for seed, network in networks.items()}
-        for file_name, network in files.items():
-            save_network(folder / f"{file_name}.npz", network)
-    return f"Written to {target}: {', '.join(files)}"
+        files = {seed: f"{stem}-{seed}" for seed in seeds}
+        for seed, network in networks.items():
+            save_network(folder / f"{files[seed]}.npz", network)
+    return f"Written to {target}: {', '.join(files.values())}"
 
 
 def save_network(path: Path, network: Any) -> None:
@@ -82,13 +87,12 @@ def show_validation(networks: Mapping[int, Any]) -> None:
 
     from benchmarks.lib.report import on_screen
 
-    about = {seed: network.provenance for seed, network in networks.items()}
-    rows = {
-        seed: {**each["validation"], "CPU (s)": each["cpu_seconds"]}
-        for seed, each in about.items()
-    }
-    shown = pd.DataFrame.from_dict(rows, "index").map("{:.4g}".format)
-    print(on_screen(shown.reset_index(names="seed")))
+    rows = {}
+    for seed, network in networks.items():
+        provenance = network.provenance
+        rows[seed] = {**provenance["validation"], "CPU (s)": provenance["cpu_seconds"]}
+    texts = pd.DataFrame.from_dict(rows, "index").map("{:.4g}".format)
+    print(on_screen(texts.reset_index(names="seed")))
 
 
 main = command("train", Options, work)

@@ -22,10 +22,17 @@ POLE: Final = float(np.abs(np.roots(PAPER.a)).max())  # its pole of the dominant
 HALF_RANGE: Final = (PAPER.range_of("u_max")[1] - PAPER.range_of("u_min")[0]) / 2.0
 HARD: Final = PRESETS["hard"]  # arguments of the environment `MiddlePointHard-v0`
 # Shortest and longest time for which a random set point of `hard` keeps a level, samples.
-HOLDS: Final = (100, 300)
+HOLD_TIMES: Final = (100, 300)
 # A hold time that never ends, samples, for set points that do not change at random.
 UNCHANGED: Final = 1e30
 DELAYS: Final = 13  # number of delays in the bank of models of each plant
+# Standard deviation of the logarithm of the time constant from an inexact step test.
+TIME_CONSTANT_SPREAD: Final = 0.35
+EXACT_GAIN_SPREAD: Final = 1e-3  # like `GAIN_SPREAD`, for the gain from an exact step test
+# Standard deviation, samples, of the prior distribution of the delay for some plants.
+DELAY_SPREAD: Final = 4.0
+# Logarithm of the probability of a model that an exact step test excludes, in effect 0.
+IMPROBABLE: Final = -200.0
 # Ranges of the environment's arguments that contain the numbers of all training plants. Every
 # episode sets the plant numbers within these ranges.
 RANGES: Final[dict[str, Any]] = {
@@ -109,12 +116,15 @@ class Sampler:
     of all plants that are not like `hard` last longer than those of `hard`, and mostly
     alternate between a positive and a negative value.
 
+    If random numbers were drawn in another order, a seed would no longer give the network that
+    was published with the seed.
+
     Parameters
     ----------
     n
         Number of plants in a batch.
     hard_share
-        Share of the plants that are like those of `hard`.
+        Share of the plants that are like the plants of the preset `hard`.
     seed
         Seed of all random numbers.
     """
@@ -127,24 +137,26 @@ class Sampler:
 
     def batch(self) -> Batch:
         """Return a new random batch of n plants for an episode."""
-        kind = self._uniform(0.0, 1.0)
-        hard = kind < self._hard_share
-        exact = kind > (1.0 + self._hard_share) / 2.0
-        numbers = self._numbers(hard)
-        reach = 0.95 * GAIN * HALF_RANGE * numbers["gain_factor"]
-        amplitudes = torch.where(self._some(0.5), 5.0, self._uniform(1.0, 6.0))
-        amplitudes = torch.where(hard, PAPER.setpoint_amplitude, amplitudes.minimum(reach))
-        setpoints, ages = self._setpoints(amplitudes, hard)
+        # One random number decides of which of three kinds a plant is.
+        kinds = self._uniform(0.0, 1.0)
+        is_hard = kinds < self._hard_share
+        is_exact = kinds > (1.0 + self._hard_share) / 2.0
+        numbers = self._plant_numbers(is_hard)
+        amplitudes = self._amplitudes(numbers["gain_factor"], is_hard)
+        setpoints, ages = self._setpoints(amplitudes, is_hard)
         innovations = torch.randn(SAMPLES + 1, self._n, generator=self._generator)
         innovations *= numbers["noise_variance"].sqrt()
         innovations[0] = 0.0  # the plant begins at rest
-        prior, gains = self._knowledge(numbers, hard, exact)
-        widest = numbers["dead_zone"] + self._uniform(0.0, 3.0) * ~exact
-        widest = torch.where(hard, HARD["dead_zone"][1], widest.clamp(max=8.0))
-        authorities = (gains * GAIN * HALF_RANGE).numpy()
+        gain_factors = self._step_test(numbers["gain_factor"], GAIN_SPREAD, is_hard, is_exact)
+        time_constant_factors = self._step_test(
+            numbers["time_constant_factor"], TIME_CONSTANT_SPREAD, is_hard, is_exact
+        )
+        prior = self._prior(time_constant_factors, numbers["delay"], is_hard, is_exact)
+        widest_zones = self._widest_dead_zones(numbers["dead_zone"], is_hard, is_exact)
+        authorities = (gain_factors * GAIN * HALF_RANGE).numpy()
         random_setpoint = RandomSetpoint(
-            shortest=np.where(hard, HOLDS[0], 0.0),
-            longest=np.where(hard, HOLDS[1], UNCHANGED),
+            shortest=np.where(is_hard, HOLD_TIMES[0], 0.0),
+            longest=np.where(is_hard, HOLD_TIMES[1], UNCHANGED),
             amplitude=amplitudes.numpy() / authorities,
         )
         return Batch(
@@ -152,12 +164,12 @@ class Sampler:
             setpoints=setpoints,
             ages=ages,
             innovations=innovations,
-            changes_by_surprise=hard,
+            changes_by_surprise=is_hard,
             amplitudes=amplitudes,
             random_setpoint=random_setpoint,
             prior=prior,
             authorities=authorities,
-            edges=(widest / HALF_RANGE + CLEARANCE).numpy(),
+            edges=(widest_zones / HALF_RANGE + CLEARANCE).numpy(),
         )
 
     def _uniform(self, low: Any, high: Any, *shape: int) -> Tensor:
@@ -169,114 +181,169 @@ class Sampler:
         values: Tensor = low + uniform * (high - low)
         return values
 
-    def _normal(self) -> Tensor:
-        """Return standard normal random numbers, limited to [-2, 2], shape (n,)."""
-        return torch.randn(self._n, generator=self._generator).clamp(-2.0, 2.0)
-
-    def _some(self, share: float) -> Tensor:
-        """Return bools, shape (n,), each of which is True with the probability `share`."""
+    def _true_for(self, share: float) -> Tensor:
+        """Return random bools, shape (n,), True with the probability `share`."""
         return self._uniform(0.0, 1.0) < share
 
-    def _numbers(self, hard: Tensor) -> dict[str, Tensor]:
-        """Return random plant numbers by the names of the environment's arguments.
+    def _plant_numbers(self, is_hard: Tensor) -> dict[str, Tensor]:
+        """Return random delays, gains and other numbers of the plants, each of shape (n,).
 
-        `hard` says which plants are like those of the preset `hard`, shape (n,). The numbers of
-        the other plants come from wider ranges. Each array of numbers has the shape (n,).
+        The keys are the names of the environment's arguments. `is_hard` says which plants are
+        like those of the preset `hard`, shape (n,). All other plants have numbers from wider
+        ranges.
         """
-        noisy, loaded, drifts = self._some(0.65), self._some(0.5), self._some(0.4)
-        octave = math.log(2.0)
-        others = {
+        is_noisy = self._true_for(0.65)
+        has_load = self._true_for(0.5)
+        drifts = self._true_for(0.4)
+        log_2 = math.log(2.0)
+        wide = {
             "delay": self._uniform(6.0, 37.0).floor(),
             "dead_zone": self._uniform(0.0, 8.0),
             "gain_factor": self._uniform(0.75, 1.6),
-            "time_constant_factor": self._uniform(-octave, octave).exp(),
-            "noise_variance": self._uniform(0.0, 1.0) * noisy,
-            "measurement_noise_variance": self._uniform(0.0, 0.2) * noisy * self._some(0.5),
-            "disturbance_amplitude": self._uniform(0.5, 2.5) * loaded,
+            "time_constant_factor": self._uniform(-log_2, log_2).exp(),
+            "noise_variance": self._uniform(0.0, 1.0) * is_noisy,
+            "measurement_noise_variance": self._uniform(0.0, 0.2)
+            * is_noisy
+            * self._true_for(0.5),
+            "disturbance_amplitude": self._uniform(0.5, 2.5) * has_load,
             "disturbance_interval": self._uniform(100.0, 300.0),
-            "disturbance_walk_variance": self._uniform(0.0, 0.001) * loaded * noisy,
+            "disturbance_walk_variance": self._uniform(0.0, 0.001) * has_load * is_noisy,
             "gain_drift": torch.where(drifts, self._uniform(0.6, 1.6), 1.0),
             "time_constant_drift": torch.where(drifts, self._uniform(0.75, 1.35), 1.0),
         }
         numbers = {}
-        for name, values in others.items():
+        for name, wide_values in wide.items():
+            # An argument of `hard` is a range [low, high] or one number.
             low, high = np.broadcast_to(HARD[name], 2).tolist()
             if name == "delay":
-                like_hard = self._uniform(low, high + 1).floor()
+                hard_values = self._uniform(low, high + 1).floor()
             else:
-                like_hard = self._uniform(low, high)
-            numbers[name] = torch.where(hard, like_hard, values)
+                hard_values = self._uniform(low, high)
+            numbers[name] = torch.where(is_hard, hard_values, wide_values)
         return numbers
 
-    def _setpoints(self, amplitudes: Tensor, hard: Tensor) -> tuple[Tensor, Tensor]:
+    def _amplitudes(self, gain_factors: Tensor, is_hard: Tensor) -> Tensor:
+        """Return random largest set points, degC, that the plants can reach, shape (n,).
+
+        `gain_factors` are the gains as multiples of the paper's gain, and `is_hard` says which
+        plants are like those of the preset `hard`, both of shape (n,).
+        """
+        reachable = 0.95 * GAIN * HALF_RANGE * gain_factors
+        amplitudes = torch.where(self._true_for(0.5), 5.0, self._uniform(1.0, 6.0))
+        return torch.where(is_hard, PAPER.setpoint_amplitude, amplitudes.minimum(reachable))
+
+    def _setpoints(self, amplitudes: Tensor, is_hard: Tensor) -> tuple[Tensor, Tensor]:
         """Return random set points, degC, and the number of samples since their last change.
 
-        `amplitudes` are the largest set points, degC, and `hard` says which plants are like
+        `amplitudes` are the largest set points, degC, and `is_hard` says which plants are like
         those of the preset `hard`, both of shape (n,). Both results have the shape
         (SAMPLES + 1, n).
         """
-        n, (shortest, longest) = self._n, HOLDS
-        low = torch.where(hard, float(shortest), self._uniform(longest + 10.0, 700.0))
-        high = torch.where(hard, float(longest), low + longest)
-        count = SAMPLES // shortest + 2
-        lengths = (low + self._uniform(0.0, 1.0, count, n) * (high + 1.0 - low)).floor()
-        starts = torch.cat([torch.zeros(1, n), lengths.cumsum(0)[:-1]])
-        levels = self._uniform(-1.0, 1.0, count, n)
+        shortest_hard, longest_hard = HOLD_TIMES
+        shortest_other = self._uniform(longest_hard + 10.0, 700.0)
+        shortest = torch.where(is_hard, float(shortest_hard), shortest_other)
+        longest = torch.where(is_hard, float(longest_hard), shortest + longest_hard)
+        count = SAMPLES // shortest_hard + 2  # levels, enough for an episode
+        shares = self._uniform(0.0, 1.0, count, self._n)
+        lengths = (shortest + shares * (longest + 1.0 - shortest)).floor()
+        starts = torch.cat([torch.zeros(1, self._n), lengths.cumsum(0)[:-1]])
+
+        random_levels = self._uniform(-1.0, 1.0, count, self._n)
         signs = torch.where(torch.arange(count)[:, None] % 2 == 0, 1.0, -1.0)
-        alternates = ~hard & self._some(0.8)
-        levels = amplitudes * torch.where(alternates, signs * levels[0].sign(), levels)
+        alternating_levels = signs * random_levels[0].sign()
+        alternates = ~is_hard & self._true_for(0.8)
+        levels = amplitudes * torch.where(alternates, alternating_levels, random_levels)
+
         samples = torch.arange(SAMPLES + 1.0)
-        times = samples.expand(n, -1).contiguous()
-        places = torch.searchsorted(starts.T.contiguous(), times, right=True)
-        number = places.T - 1  # of the level at each sample
-        return levels.gather(0, number), samples[:, None] - starts.gather(0, number)
+        samples_of_plants = samples.expand(self._n, -1).contiguous()
+        # The number of levels that have started at each sample of each plant, shape
+        # (n, SAMPLES + 1): `searchsorted` needs one sorted row for each plant.
+        started = torch.searchsorted(starts.T.contiguous(), samples_of_plants, right=True)
+        level_numbers = started.T - 1
+        ages = samples[:, None] - starts.gather(0, level_numbers)
+        return levels.gather(0, level_numbers), ages
 
-    def _knowledge(
-        self, numbers: dict[str, Tensor], hard: Tensor, exact: Tensor
-    ) -> tuple[Prior, Tensor]:
-        """Return the prior knowledge of the plants, and the gains of their step tests.
-
-        The bank of every plant has the same number of models. For a plant with an exact step
-        test, the model of the step test has the probability 1.
+    def _step_test(
+        self, factors: Tensor, spread: float, is_hard: Tensor, is_exact: Tensor
+    ) -> Tensor:
+        """Return the gains or the time constants that the step tests of the plants find.
 
         Parameters
         ----------
-        numbers
-            The plant numbers, by the names of the environment's arguments.
-        hard
-            Whether a plant is like those of the preset `hard`, shape (n,).
-        exact
-            Whether the step test of a plant is exact, shape (n,).
+        factors
+            The plants' gains or time constants, as multiples of the paper's, shape (n,).
+        spread
+            Standard deviation of the logarithm of the ratio of a found value to the true value.
+        is_hard
+            Whether a plant is like those of the preset `hard`, shape (n,). Then the step test
+            finds the middle of the range of `hard`.
+        is_exact
+            Whether the step test finds the true value, for plants unlike `hard`, shape (n,).
 
         Returns
         -------
-        prior : Prior
-            Models and probabilities, for the bank of models.
-        gains : Tensor
-            Gains of the step tests, as multiples of the paper's gain, shape (n,).
+        Tensor
+            The found values, as multiples of the paper's, shape (n,).
         """
-        middle = sum(HARD["gain_factor"]) / 2.0  # of gain and time constant in `hard`
-        wrong = {"gain_factor": GAIN_SPREAD, "time_constant_factor": 0.35}
-        known = {}
-        for name, spread in wrong.items():
-            off = torch.where(exact, 0.0, spread * self._normal())
-            known[name] = torch.where(hard, middle, numbers[name] * off.exp())
-        constants = -1.0 / torch.log(1.0 - (1.0 - POLE) / known["time_constant_factor"])
-        place = self._uniform(0.0, DELAYS).floor()  # of the plant's delay in the bank
-        shortest = (numbers["delay"] - place).clamp(min=1.0)
-        shortest = torch.where(hard, HARD["delay"][0], shortest)
-        off = torch.arange(float(DELAYS))[:, None] - (numbers["delay"] - shortest)
-        graded = ~hard & self._some(0.5)
-        of_delay = -0.5 * (off / 4.0).square() * graded
-        is_middle = torch.from_numpy(TIME_CONSTANTS == 1.0)
-        excluded = exact & ~((off[:, None] == 0.0) & is_middle[:, None])
-        of_constants = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
-        logarithms = of_delay[:, None] + torch.from_numpy(of_constants)[:, None]
-        logarithms = logarithms + torch.where(excluded, -200.0, 0.0)
-        prior = Prior(
-            time_constants=(torch.from_numpy(TIME_CONSTANTS)[:, None] * constants).numpy(),
+        middle = sum(HARD["gain_factor"]) / 2.0  # for the time constant, the range is equal
+        normal = torch.randn(self._n, generator=self._generator).clamp(-2.0, 2.0)
+        log_errors = torch.where(is_exact, 0.0, spread * normal)
+        return torch.where(is_hard, middle, factors * log_errors.exp())
+
+    def _prior(
+        self, time_constant_factors: Tensor, delays: Tensor, is_hard: Tensor, is_exact: Tensor
+    ) -> Prior:
+        """Return the models and their probabilities, from which the bank of each plant starts.
+
+        The bank of every plant has `DELAYS` delays times the time constants of
+        `TIME_CONSTANTS`. For a plant with an exact step test, the model of the step test has
+        the probability 1. For half of the inexact step tests, a model is less probable if its
+        delay is wrong.
+
+        Parameters
+        ----------
+        time_constant_factors
+            Time constants of the step tests, as multiples of the paper's, shape (n,).
+        delays
+            The plants' delays, samples, shape (n,).
+        is_hard
+            Whether a plant is like those of the preset `hard`, shape (n,).
+        is_exact
+            Whether the step test of a plant is exact, shape (n,).
+        """
+        poles = 1.0 - (1.0 - POLE) / time_constant_factors
+        time_constants = -1.0 / torch.log(poles)  # samples
+        place = self._uniform(
+            0.0, DELAYS
+        ).floor()  # of the plant's delay among those of the bank
+        shortest = (delays - place).clamp(min=1.0)
+        shortest = torch.where(is_hard, HARD["delay"][0], shortest)
+        delay_errors = torch.arange(float(DELAYS))[:, None] - (delays - shortest)
+        has_delay_prior = ~is_hard & self._true_for(0.5)
+        of_delays = -0.5 * (delay_errors / DELAY_SPREAD).square() * has_delay_prior
+        of_time_constants = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
+        has_middle_time_constant = torch.from_numpy(TIME_CONSTANTS == 1.0)[:, None]
+        is_step_test = (delay_errors[:, None] == 0.0) & has_middle_time_constant
+        # Now of each model, shape (DELAYS, time constants, n).
+        logarithms = of_delays[:, None] + torch.from_numpy(of_time_constants)[:, None]
+        logarithms += torch.where(is_exact & ~is_step_test, IMPROBABLE, 0.0)
+        return Prior(
+            time_constants=(torch.from_numpy(TIME_CONSTANTS)[:, None] * time_constants).numpy(),
             shortest_delays=shortest.numpy(),
             log_probabilities=logarithms.numpy(),
-            gain_spread=torch.where(exact, 1e-3, GAIN_SPREAD).numpy(),
+            gain_spread=torch.where(is_exact, EXACT_GAIN_SPREAD, GAIN_SPREAD).numpy(),
         )
-        return prior, known["gain_factor"]
+
+    def _widest_dead_zones(
+        self, dead_zones: Tensor, is_hard: Tensor, is_exact: Tensor
+    ) -> Tensor:
+        """Return the greatest half width that each dead zone may have, t/h, shape (n,).
+
+        Controllers know the greatest half width. With an exact step test (`is_exact`), it is
+        the half width of the plant's own dead zone, `dead_zones`. For plants like those of the
+        preset `hard` (`is_hard`), it is the greatest half width in `hard`. All arguments have
+        the shape (n,).
+        """
+        margins = self._uniform(0.0, 3.0) * ~is_exact
+        widest = (dead_zones + margins).clamp(max=8.0)
+        return torch.where(is_hard, HARD["dead_zone"][1], widest)

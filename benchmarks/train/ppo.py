@@ -9,7 +9,7 @@ observations with a longer past, and the validation of trained policies.
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import numpy as np
@@ -39,14 +39,21 @@ TRAINING_SEEDS = SEEDS["training"].first  # least seed of the training plants
 # Change of the flow per sample at an action of 1, as a share of half the actuator's range: with
 # 2.0, the flow can cross the entire range in a sample.
 MAX_MOVE = 2.0
+SETPOINT_SCALE = 0.2  # from degC to an input of order 1
+
+
+class TrainingPlants(NamedTuple):
+    """Training plants of one kind."""
+
+    number: int  # number of plants
+    arguments: Mapping[str, Any]  # their arguments of the environment
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
     """The settings of a training of a policy by PPO."""
 
-    # Kinds of training plants: the number of plants, and their arguments of the environment.
-    plants: tuple[tuple[int, Mapping[str, Any]], ...]
+    plants: tuple[TrainingPlants, ...]  # the kinds of training plants
     # Arguments of the environment for each case of the validation, by name. No published result
     # uses these cases.
     cases: Mapping[str, Mapping[str, Any]]
@@ -66,28 +73,36 @@ class Recipe:
     @property
     def windows(self) -> dict[str, Any]:
         """The arguments of the environment that determine the policy's observation."""
-        past = {"output_window": self.memory, "action_window": self.memory}
-        return {"setpoint_window": 3, "error_window": 1, **past}
+        return {
+            "setpoint_window": 3,
+            "error_window": 1,
+            "output_window": self.memory,
+            "action_window": self.memory,
+        }
 
     @property
     def temperature_scale(self) -> float:
         """The amplitude of the set points, as a multiple of the paper's amplitude."""
-        _, arguments = self.plants[0]
-        scale: float = arguments.get("error_scale", _ERROR_SCALE) / _ERROR_SCALE
-        return scale
+        error_scale: float = self.plants[0].arguments.get("error_scale", ERROR_SCALE)
+        return error_scale / ERROR_SCALE
 
 
 # The error, degC, at which the reward is -1. With this scale, returns are of order 1, so that
 # the value function is learnt quickly.
-_ERROR_SCALE = 50.0
-_COST = {"reward": "absolute", "error_scale": _ERROR_SCALE}
-_RANDOM = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
-_SLOWER = {"setpoint_amplitude": 5.4, "setpoint_period": 500}
+ERROR_SCALE = 50.0
+_COST = {"reward": "absolute", "error_scale": ERROR_SCALE}
+_RANDOM: dict[str, Any] = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
+_NOISE = 0.6  # noise variance of most training plants of the recipe `ppo`, degC^2
+# The square wave of the validation differs from that of the published results.
+_VALIDATION: dict[str, Any] = {"setpoint_amplitude": 5.4, "setpoint_period": 500}
 
 RECIPES = {
     "ppo": Recipe(
-        plants=((152, _RANDOM), (360, {**_RANDOM, "noise_variance": 0.6})),
-        cases={"calm": _SLOWER, "noise": {**_SLOWER, "noise_variance": 0.4}},
+        plants=(
+            TrainingPlants(152, _RANDOM),
+            TrainingPlants(360, {**_RANDOM, "noise_variance": _NOISE}),
+        ),
+        cases={"calm": _VALIDATION, "noise": {**_VALIDATION, "noise_variance": 0.4}},
         dead_zone=5.0,
         levels=False,
         hidden=(),
@@ -96,7 +111,7 @@ RECIPES = {
         log_std=(-1.2, -4.0),
     ),
     "ppo-hard": Recipe(
-        plants=((512, {**PRESETS["hard"], **_COST, "setpoint_amplitude": 5.5}),),
+        plants=(TrainingPlants(512, {**PRESETS["hard"], **_COST, "setpoint_amplitude": 5.5}),),
         cases={"hard": {**PRESETS["hard"], "setpoint_amplitude": 5.5, "setpoint_period": 560}},
         dead_zone=0.0,
         levels=True,
@@ -108,7 +123,7 @@ RECIPES = {
 
 
 def for_plant(plant: Mapping[str, Any]) -> Recipe:
-    """Return the recipe `ppo` for another plant than the paper's.
+    """Return the recipe `ppo`, adapted to a plant that is not the paper's.
 
     Set points, errors and temperatures are scaled in proportion to `setpoint_amplitude`. If the
     plant has no noise, most training plants get noise in proportion to the largest temperature
@@ -119,30 +134,36 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
     plant
         Arguments of the environment for the plant.
     """
-    parameters, paper = Parameters(**plant), Parameters()
+    parameters = Parameters(**plant)
+    paper = Parameters()
     amplitude = parameters.setpoint_amplitude / paper.setpoint_amplitude
     training = {
         **plant,
         "reward": "absolute",
-        "error_scale": _ERROR_SCALE * amplitude,
+        "error_scale": ERROR_SCALE * amplitude,
         "setpoint": "random",
-        "setpoint_amplitude": 6.0 * amplitude,
+        "setpoint_amplitude": _RANDOM["setpoint_amplitude"] * amplitude,
     }
     noisy = dict(training)
     if parameters.range_of("noise_variance")[1] == 0.0:
         scale, paper_scale = scale_of(parameters), scale_of(paper)
         ratio = scale.temperature_range / paper_scale.temperature_range
-        noisy["noise_variance"] = 0.6 * ratio**2
+        noisy["noise_variance"] = _NOISE * ratio**2
+    # A period of 500 samples for the paper's 600, and always an even number of samples.
+    half_period = max(1, round(parameters.setpoint_period * 500 / 1200))
     validation = {
         **plant,
         "setpoint": "square",
-        "setpoint_amplitude": 5.4 * amplitude,
-        "setpoint_period": max(2, 2 * round(parameters.setpoint_period * 500 / 1200)),
+        "setpoint_amplitude": _VALIDATION["setpoint_amplitude"] * amplitude,
+        "setpoint_period": 2 * half_period,
     }
-    (calm, _), (rest, _) = RECIPES["ppo"].plants
+    calm_kind, noisy_kind = RECIPES["ppo"].plants
     return replace(
         RECIPES["ppo"],
-        plants=((calm, training), (rest, noisy)),
+        plants=(
+            TrainingPlants(calm_kind.number, training),
+            TrainingPlants(noisy_kind.number, noisy),
+        ),
         cases={"plant": validation},
         dead_zone=sum(parameters.range_of("dead_zone")) / 2.0,
     )
@@ -160,20 +181,21 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
     seed
         Seed of the initial weights, the exploration and the plants.
     plant
-        Arguments of the environment for the plant that the recipe was made for by `for_plant`;
-        None for one of `RECIPES`.
+        Arguments of the environment for the plant, if `for_plant` has made the recipe. None if
+        the recipe is one of `RECIPES`.
     """
-    began, model = time.process_time(), begin(recipe, seed)
+    began = time.process_time()
+    model = begin(recipe, seed)
     model.learn(recipe.steps, callback=Exploration(*recipe.log_std))
     seconds = time.process_time() - began
     policy = export(model, recipe)
     if plant is not None:
         parameters = Parameters(**plant)
         policy = replace(policy, **knowledge(LIMITS, parameters, 1, seed))
-    validation = {
-        name: evaluate(policy, seed=VALIDATION_SEED, **recipe.windows, **case).mean_error
-        for name, case in recipe.cases.items()
-    }
+    validation = {}  # mean errors, degC
+    for name, case in recipe.cases.items():
+        result = evaluate(policy, seed=VALIDATION_SEED, **recipe.windows, **case)
+        validation[name] = result.mean_error
     policy.provenance = {
         "algorithm": "PPO of Stable-Baselines3",
         "recipe": asdict(recipe) | SETTINGS,
@@ -212,13 +234,21 @@ class Plants(GymnasiumVecEnv):
     """
 
     def __init__(self, recipe: Recipe) -> None:
-        moves = {"max_move": MAX_MOVE, "compensate_dead_zone": recipe.dead_zone}
-        same = {**recipe.windows, "autoreset_mode": "SameStep"}
-        batches = (
-            gymnasium.make_vec("MiddlePoint-v0", number, **same, **arguments)
-            for number, arguments in recipe.plants
-        )
-        super().__init__(*(IncrementalAction(each, **moves) for each in batches), group=GROUP)
+        batches = []
+        for plants in recipe.plants:
+            batch = gymnasium.make_vec(
+                "MiddlePoint-v0",
+                plants.number,
+                autoreset_mode="SameStep",
+                **recipe.windows,
+                **plants.arguments,
+            )
+            batches.append(
+                IncrementalAction(
+                    batch, max_move=MAX_MOVE, compensate_dead_zone=recipe.dead_zone
+                )
+            )
+        super().__init__(*batches, group=GROUP)
         self._features = features(recipe).T.astype(np.float32)
         self.observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
 
@@ -227,22 +257,23 @@ class Plants(GymnasiumVecEnv):
 
         The seeds follow from `seed`, and no comparison of controllers uses them.
         """
-        (first,) = np.random.SeedSequence(seed).generate_state(1).tolist()
-        return super().seed(TRAINING_SEEDS + first)
+        offset = int(np.random.SeedSequence(seed).generate_state(1)[0])  # below 2**32
+        return super().seed(TRAINING_SEEDS + offset)
 
     def reset(self) -> NDArray[Any]:
         """Reset all plants, and return their observations, shape (plants, inputs)."""
         return super().reset() @ self._features
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all plants by the actions of `step_async`; return what `VecEnv` asks for.
+        """Step all plants by the actions of `step_async`, as a `VecEnv` does.
 
-        Observations, and the last observations of ended episodes in the infos, are converted to
+        The returned observations, and the last observations of ended episodes in the infos, are
         the policy's inputs.
         """
         observations, rewards, ended, infos = super().step_wait()
         for i in np.flatnonzero(ended).tolist():
-            infos[i]["terminal_observation"] = infos[i]["terminal_observation"] @ self._features
+            last_observation = infos[i]["terminal_observation"]
+            infos[i]["terminal_observation"] = last_observation @ self._features
         return cast("Array", observations) @ self._features, rewards, ended, infos
 
 
@@ -252,12 +283,17 @@ def features(recipe: Recipe) -> Array:
     The shape is (inputs, size of the observation). The inputs are the error and the changes of
     set point, temperature and flow and, with `recipe.levels`, the set point and the flow.
     """
-    one = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
-    one[: -recipe.memory] /= recipe.temperature_scale  # all but the flows are temperatures
-    seen = inputs(one, recipe.windows)
-    if recipe.levels:  # the set point and the flow
-        seen = torch.hstack([seen, 0.2 * one[:, :1], one[:, -recipe.memory, None]])
-    return cast("Array", seen.numpy().T)
+    # The inputs are linear in the observation. So row i of the transposed matrix is the inputs
+    # for an observation that is 1 at the element i and 0 elsewhere.
+    observations = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
+    # The last elements are the past flows; all elements before them are temperatures.
+    observations[: -recipe.memory] /= recipe.temperature_scale
+    transposed = inputs(observations, recipe.windows)
+    if recipe.levels:
+        setpoint = SETPOINT_SCALE * observations[:, :1]
+        flow = observations[:, -recipe.memory, None]
+        transposed = torch.hstack([transposed, setpoint, flow])
+    return cast("Array", transposed.numpy().T)
 
 
 def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
@@ -266,14 +302,15 @@ def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
     The conversion of observations to inputs becomes part of the first layer. `model` was
     trained with `recipe`.
     """
-    layers = [
-        (layer.weight.detach().double().numpy(), layer.bias.double().numpy())
-        for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net)
-        if isinstance(layer, nn.Linear)
-    ]
-    (weights, bias), *others = layers
+    layers = []
+    for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net):
+        if isinstance(layer, nn.Linear):  # The other layers are activation functions.
+            weights = layer.weight.detach().double().numpy()
+            layers.append((weights, layer.bias.detach().double().numpy()))
+    first_weights, first_biases = layers[0]
+    layers[0] = (first_weights @ features(recipe), first_biases)
     return PolicyNetwork(
-        [(weights @ features(recipe), bias), *others],
+        layers,
         observation=recipe.windows,
         input_scale=np.ones(sum(recipe.windows.values())),
         activation="tanh",
