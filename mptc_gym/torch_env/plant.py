@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics, least_effective
 from mptc_gym.plant.parameters import Parameters, PlantNumbers
-from mptc_gym.torch_env.episodes import Block, Episodes, History, Number
+from mptc_gym.torch_env.episodes import Block, Episodes, History, Number, Restart
 
 
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
@@ -44,9 +44,9 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
     # 1 where the command passes the dead zone, otherwise 0: a product is much faster than an
     # unpredictable branch.
-    if not command.requires_grad:
-        return limited.mul_(command.abs().gt_(edge))
     passes = command.detach().abs().gt_(edge)
+    if not command.requires_grad:
+        return limited.mul_(passes)
     # limited + constant * (passes - 1) has the value of limited * passes, but the gradient of
     # `limited`.
     return torch.addcmul(limited, limited.detach(), passes.sub_(1.0))
@@ -65,8 +65,8 @@ class TorchPlants:
     Attributes
     ----------
     most_samples : int
-        The most samples in a block: d + 1, with d the shortest delay that can be drawn. The
-        temperatures of the d + 1 samples after an action follow from the actions so far.
+        The most samples in a block: d + 1, with d the shortest delay that can be drawn. No
+        later action affects the temperatures of the d + 1 samples after an action.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
@@ -77,31 +77,22 @@ class TorchPlants:
         self._changes_dynamics = parameters.changes_dynamics
         self._drift_samples = parameters.drift_samples
         self._beta = tuple(parameters.b)
-        shortest, self._longest = map(int, parameters.range_of("delay"))
-        self.most_samples = shortest + 1
+        shortest_delay, self._longest_delay = map(int, parameters.range_of("delay"))
+        self.most_samples = shortest_delay + 1
         # The applied flows that terms of the polynomial B still need, t/h, the oldest first.
-        flows = self._longest + len(self._beta)
+        flows = self._longest_delay + len(self._beta)
         self._flows = deque([self._zeros] * flows, flows)
         # The temperatures, degC. The polynomial A needs as many past temperatures as A has
         # coefficients from z^-1 on.
         self._outputs = History(self._zeros, len(parameters.a) - 1)
 
-    def reset(self, mask: Tensor, age: Tensor | int, rows_to_drop: int) -> None:
+    def reset(self, restart: Restart, age: Tensor | int) -> None:
         """Bring some plants to rest, with the plant numbers of the present episodes.
 
-        Parameters
-        ----------
-        mask
-            True for the plants to reset, shape (n,).
-        age
-            The sample k of all plants, shape (n,), or one number for all plants; 0 for plants
-            in the mask.
-        rows_to_drop
-            How many samples at the end of the latest block are dropped, as the environment has
-            not returned them.
+        `age` is the sample k of each plant, shape (n,), or one number for all plants.
         """
-        self._outputs.reset(mask, rows_to_drop)
-        self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
+        self._outputs.reset(restart)
+        self._flows.extend(torch.stack([*self._flows]).masked_fill_(restart.mask, 0.0).unbind())
         self._reset_actuator()
         self._reset_delays()
         numbers = PlantNumbers(**self._episodes.numbers)
@@ -127,15 +118,18 @@ class TorchPlants:
         self._edge = least_effective(numbers["dead_zone"], u_min, u_max, rounding)
 
     def _reset_delays(self) -> None:
-        """Compute the indices of each plant's delayed flows in all flows, if delays differ."""
-        self._places: Tensor | None = None  # indices in the flattened flows
+        """Compute where each plant's delayed flows are in all flows, if the delays differ.
+
+        `_delayed_at` holds the indices in the flattened flows of `_response`.
+        """
+        self._delayed_at: Tensor | None = None
         delay = self._episodes.numbers["delay"]
         if isinstance(delay, Tensor):
             n = len(self._zeros)
             columns = torch.arange(n, device=delay.device)
             rows = torch.arange(self.most_samples + len(self._beta) - 1, device=delay.device)
-            first_rows = self._longest - delay.to(torch.int64)
-            self._places = (rows[:, None] + first_rows) * n + columns
+            first_rows = self._longest_delay - delay.to(torch.int64)
+            self._delayed_at = (rows[:, None] + first_rows) * n + columns
 
     def _update_dynamics(self, age: Tensor | int) -> None:
         """Compute gain, time constant and coefficients of the plants at the sample k = `age`.
@@ -193,10 +187,10 @@ class TorchPlants:
         outputs = [*self._outputs.rows]
         factors: list[tuple[Number, ...]] = []
         response = self._response(block.samples)
-        # The rows of the block at which coefficients change; between two changes, the
-        # coefficients are constant.
         changes = block.due_rows if self._drifts else []
-        for first, end in pairwise(sorted({0, *changes, block.samples})):
+        # Between two of these rows of the block, the coefficients are constant.
+        boundaries = sorted({0, *changes, block.samples})
+        for first, end in pairwise(boundaries):
             if first in changes:
                 self._update_dynamics(block.age(first))
             factors += [self._factors] * (end - first)
@@ -207,8 +201,7 @@ class TorchPlants:
                 forced = forced * self._scale
             if load is not None:
                 forced = _add_product(forced, self._load_gain, load[first:end])
-            for forced_row in forced.unbind():
-                output = forced_row
+            for output in forced.unbind():
                 for lag, coefficient in enumerate(self._alpha, start=1):
                     output = _add_product(output, coefficient, outputs[-lag])
                 outputs.append(output)
@@ -227,17 +220,18 @@ class TorchPlants:
         The part at sample k is B(z^-1) u_a(k-d), with the polynomial B of equation (28) of the
         paper, applied flow u_a and delay d. `samples` is the number of samples in the block.
         """
-        needed = samples + len(self._beta) - 1
-        if self._places is None:
-            flows = torch.stack([*islice(self._flows, needed)])
+        # One delayed flow for each sample, and earlier flows for the further terms of B.
+        rows = samples + len(self._beta) - 1
+        if self._delayed_at is None:
+            delayed_flows = torch.stack([*islice(self._flows, rows)])
         else:
-            older = self._longest - self.most_samples + 1
-            all_flows = torch.stack([*islice(self._flows, older + needed)]).reshape(-1)
-            places = self._places[:needed].reshape(-1)
-            flows = all_flows.index_select(0, places).view(needed, -1)
-        response = flows[-samples:] * self._beta[0]
+            difference_of_delays = self._longest_delay - self.most_samples + 1
+            all_flows = torch.stack([*islice(self._flows, difference_of_delays + rows)])
+            indices = self._delayed_at[:rows].reshape(-1)
+            delayed_flows = all_flows.reshape(-1).index_select(0, indices).view(rows, -1)
+        response = delayed_flows[-samples:] * self._beta[0]
         for lag, coefficient in enumerate(self._beta[1:], start=1):
-            earlier = flows[needed - samples - lag : needed - lag]
+            earlier = delayed_flows[rows - samples - lag : rows - lag]
             response = response.add_(earlier, alpha=coefficient)
         return response
 
