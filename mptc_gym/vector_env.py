@@ -90,6 +90,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
+        """Prepare the plants; the docstring of the class describes the arguments."""
         one_of("render_mode", render_mode, [None, "rgb_array"])
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
         parameters = self.parameters

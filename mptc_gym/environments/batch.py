@@ -65,6 +65,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         autoreset_mode: str | AutoresetMode,
         arguments: Mapping[str, Any],
     ) -> None:
+        """Prepare the plants; the docstring of the class describes the arguments."""
         self.parameters = Parameters.of_environment(arguments)
         self.num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
         limit = -1 if max_episode_steps is None else max_episode_steps

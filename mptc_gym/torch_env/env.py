@@ -72,13 +72,13 @@ class MiddlePointTorchEnv(BatchEnv):
     Parameters
     ----------
     num_envs, max_episode_steps, autoreset_mode
-        The same as for `MiddlePointVectorEnv`, but `final_obs` is a tensor, which is 0 for
-        plants whose episode has not ended.
+        See `MiddlePointVectorEnv`. In `MiddlePointTorchEnv`, `final_obs` is a tensor, with
+        zeros for plants whose episode has not ended.
     device
         Device of all computations and tensors.
     dtype
         torch.float32 or torch.float64: the type of all computations and of the observations.
-        The type of the spaces is always float32.
+        The spaces are always float32.
     differentiable
         Whether observations, rewards and infos carry PyTorch's gradient graph back to the
         actions of the present and of earlier steps; see Gradients.
@@ -105,9 +105,9 @@ class MiddlePointTorchEnv(BatchEnv):
     **Random numbers.** All random numbers come from one `torch.Generator` on the device, which
     `reset(seed=seed)` restarts. The same seed, arguments and resets give the same numbers on
     the same device, with the same versions of this package and of PyTorch. The random numbers
-    have the distributions of `MiddlePointVectorEnv`, but other values. The j-th episode of a
-    plant depends on the length of earlier episodes and on the other plants. So compare
-    controllers in `MiddlePointVectorEnv`, or on external signals.
+    have the distributions of `MiddlePointVectorEnv`, but other values. Unlike there, the j-th
+    episode of a plant depends on the length of earlier episodes and on the other plants. So
+    compare controllers in `MiddlePointVectorEnv`, or on external signals.
 
     **External signals.** `reset(options={"signals": signals})` takes a dict of tensors. "noise"
     (the noise n), "setpoint" (the set point y_d), "disturbance" (the load w) and
@@ -115,8 +115,8 @@ class MiddlePointTorchEnv(BatchEnv):
     dict may also hold a number per plant, shape (num_envs,), for each argument that is a range,
     under the argument's name. If a tensor has a further, leading dimension, the j-th episode of
     a plant gets the j-th element; after the last element, the first element follows again.
-    Signals and arguments that are not in the dict are random. A step beyond the last sample of
-    a signal raises a ValueError.
+    Signals and ranges that are not in the dict are generated as usual. A step beyond the last
+    sample of a signal raises a ValueError.
 
     **Gradients.** The gradient of rewards and observations with respect to actions goes
     straight through the dead zone, as if there were no dead zone: so a policy also learns from
@@ -151,6 +151,7 @@ class MiddlePointTorchEnv(BatchEnv):
         differentiable: bool = False,
         **arguments: Any,
     ) -> None:
+        """Prepare the plants; the docstring of the class describes the arguments."""
         one_of("render_mode", arguments.pop("render_mode", None), [None])
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
@@ -301,16 +302,18 @@ class MiddlePointTorchEnv(BatchEnv):
         """
         restart = Restart(self._as_array(mask), unused_rows=len(self._ahead))
         if mask.all():
-            # No plant needs past samples. External signals have no rows to drop either, which
-            # matters if other signals follow from now on.
+            # No plant needs past samples. Nor can every signal drop rows: a random signal that
+            # now takes the place of an external signal has not computed the latest block.
             restart = restart._replace(unused_rows=0)
             self.detach()
         self._ahead = []
         first_infos = self._episodes.reset(restart, self._clock, self._starts, self._external)
         self._plants.reset(restart, self._clock - self._episodes.starts)
-        first_signals = {name: signal.reset(restart) for name, signal in self._signals.items()}
+        first_values: dict[str, Tensor] = {}
+        for name, signal in self._signals.items():
+            first_values[name] = signal.reset(restart)
+        setpoint = first_values["setpoint"]
         self._load = self._load.masked_fill(restart.mask, 0.0)
-        setpoint = first_signals["setpoint"]
         numbers = self._episodes.numbers
         rest_action = self._zeros + action_from_command(0.0, numbers["u_min"], numbers["u_max"])
         self._action = torch.where(restart.mask, rest_action, self._action)
@@ -399,7 +402,7 @@ class MiddlePointTorchEnv(BatchEnv):
 
 
 def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePointTorchEnv:
-    """Make many plants of an id or a spec, as `gymnasium.make_vec` does in NumPy.
+    """Make many plants of an id or a spec in PyTorch, as `gymnasium.make_vec` does in NumPy.
 
     Parameters
     ----------
@@ -413,7 +416,7 @@ def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePoint
     Returns
     -------
     MiddlePointTorchEnv
-        The plants. Their `spec` makes one of these plants in NumPy, as in
+        The plants. Their `spec` stands for one of these plants in NumPy, as in
         `mptc_gym.evaluate(policy, plants.spec)`.
 
     Raises
@@ -421,19 +424,17 @@ def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePoint
     ValueError
         If the id is unknown or of another environment, or an argument is out of range.
     """
-    of_plant = {name: value for name, value in arguments.items() if name in ARGUMENTS}
+    single_arguments = {name: arguments[name] for name in ARGUMENTS if name in arguments}
     if "max_episode_steps" in arguments:
         limit = arguments["max_episode_steps"]
-        of_plant["max_episode_steps"] = -1 if limit is None else limit
-    single = make_one(env, of_plant)
-    plant, spec = single.unwrapped, cast("EnvSpec", single.spec)
+        single_arguments["max_episode_steps"] = -1 if limit is None else limit
+    single = make_one(env, single_arguments)
+    plant = single.unwrapped
+    spec = cast("EnvSpec", single.spec)
     if not isinstance(plant, MiddlePointEnv) or spec.additional_wrappers:
         reject("env", env, "the id or the spec of a MiddlePointEnv, without wrappers")
-    arguments = {
-        **asdict(plant.parameters),
-        "max_episode_steps": spec.max_episode_steps,
-        **arguments,
-    }
-    plants = MiddlePointTorchEnv(num_envs, **arguments)
-    plants.spec = spec
-    return plants
+    arguments_of_id = asdict(plant.parameters)
+    arguments_of_id["max_episode_steps"] = spec.max_episode_steps
+    envs = MiddlePointTorchEnv(num_envs, **(arguments_of_id | arguments))
+    envs.spec = spec
+    return envs

@@ -1,8 +1,8 @@
-"""Keep the episodes of many plants in PyTorch: times, plant numbers, values from outside.
+"""Keep the episodes of many plants in PyTorch: times, plant numbers, external values.
 
-The environment computes blocks of samples ahead. Times are counted in steps of the environment.
-A reset of some plants may come before `step` has returned all samples of a block. The unused
-samples at the end of the block are then dropped, and computed anew for all plants.
+Times are counted in steps of the environment, which computes blocks of samples ahead. If some
+plants are reset before `step` has returned all samples of a block, the unused samples at the
+end of the block are dropped, and computed anew for all plants.
 """
 
 from collections.abc import Mapping, Sequence
@@ -68,23 +68,17 @@ class Restart(NamedTuple):
 
 
 class History:
-    """The latest values of a quantity of n plants: one tensor of shape (n,) for each sample.
-
-    Parameters
-    ----------
-    zeros
-        Zeros of the device and type to use, shape (n,).
-    length
-        How many samples before the latest block are kept.
+    """The latest values of a quantity of n plants.
 
     Attributes
     ----------
     rows : list of Tensor
-        The values, the oldest first: the values of the `length` samples before the latest
-        block, then the values of the block.
+        The values, one tensor of shape (n,) for each sample, the oldest first: some samples
+        before the latest block, then the samples of the block.
     """
 
     def __init__(self, zeros: Tensor, length: int) -> None:
+        """Begin with values of 0, shape (n,), and keep `length` samples before each block."""
         self.rows = [zeros] * length
         self._length = length
 
@@ -111,13 +105,6 @@ class History:
 class Episodes:
     """The present episodes of n plants: when the episodes began, and the plant numbers.
 
-    Parameters
-    ----------
-    parameters
-        The arguments of the environment.
-    zeros
-        Zeros of the device and type to use, shape (n,).
-
     Attributes
     ----------
     zeros : Tensor
@@ -132,6 +119,10 @@ class Episodes:
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
+        """Prepare the plant numbers of n plants, before the first reset.
+
+        `zeros`, shape (n,), has the device and the type of all tensors.
+        """
         self.zeros = zeros
         self.generator = torch.Generator(zeros.device)
         self.generator.seed()  # from the operating system, until `reset` gets a seed
@@ -147,8 +138,9 @@ class Episodes:
             self.numbers[name] = zeros + lowest if name in tensor_names else float(lowest)
         self.starts: Tensor | int = 0
         # Load and drifting dynamics change when the age of an episode is a multiple of
-        # `DRIFT_INTERVAL`: when the time, divided by `DRIFT_INTERVAL`, leaves one of these
-        # remainders. The remainders are on the host, so that nothing waits for the device.
+        # `DRIFT_INTERVAL`: when the time, divided by `DRIFT_INTERVAL`, leaves the remainder of
+        # an episode's start. The remainders are on the host, so that nothing waits for the
+        # device.
         self._due_remainders: set[int] = set()
 
     def reset(
@@ -170,13 +162,12 @@ class Episodes:
             The time at which each plant's episode began, shape (n,): `time` for plants whose
             episode begins.
         external
-            The plant numbers that come from outside instead of being random, by name.
+            Plant numbers from outside, by name, in place of random numbers.
 
         Returns
         -------
         dict of Tensor
-            The plant numbers by name, shape (n,). Only the elements of plants whose episode
-            begins have a meaning.
+            The plant numbers by name, shape (n,). Elements of other plants have no meaning.
         """
         numbers: dict[str, Tensor] = {}
         for name, (low, high) in self._ranges.items():
@@ -225,19 +216,17 @@ class ExternalValues:
     After the last episode in the tensor, the first episode follows again. After the last sample
     of an episode, the value of this sample is held.
 
-    Parameters
-    ----------
-    values
-        The values of the signal, degC, or of the plant number, shape (episodes, samples, n). A
-        plant number has one sample.
-
     Attributes
     ----------
     last_sample : int
-        The last sample k of an episode that has a value of its own.
+        The last sample k of an episode for which the tensor has a value.
     """
 
     def __init__(self, values: Tensor) -> None:
+        """Store values, degC, of a signal of n plants, shape (episodes, samples, n).
+
+        A plant number, in the unit of its argument, has one sample.
+        """
         self._values = values
         # The index of each plant's present episode, shape (n,).
         self._episode = torch.full_like(values[0, 0], -1, dtype=torch.int64)
@@ -265,22 +254,19 @@ class ExternalValues:
 def read_external(
     signals: Any, parameters: Parameters, zeros: Tensor
 ) -> dict[str, ExternalValues]:
-    """Return the values in `options["signals"]` of a reset, checked, by name.
+    """Return the signals and plant numbers in `options["signals"]` of a reset, by name.
+
+    A ValueError is raised for an unknown name, and for values that have the wrong shape, are
+    not finite or out of range.
 
     Parameters
     ----------
     signals
-        A dict of signals and plant numbers by name, as in `MiddlePointTorchEnv`; None for no
-        values from outside.
+        `options["signals"]`, as in `MiddlePointTorchEnv`; None if there is no such option.
     parameters
         The arguments of the environment.
     zeros
         Zeros of the device and type to use, shape (n,).
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown, or if values have the wrong shape, are not finite or out of range.
     """
     if signals is None:
         return {}
@@ -307,25 +293,22 @@ def read_external(
 
 
 def _finite_values(path: str, value: Any, zeros: Tensor, dimensions: int, shape: str) -> Tensor:
-    """Return numbers from outside as a tensor that has a leading dimension of episodes.
+    """Return numbers of the user as a tensor that has a leading dimension of episodes.
+
+    A ValueError is raised if `value` holds no finite numbers, or has a wrong shape.
 
     Parameters
     ----------
     path
         What an error message calls the numbers.
     value
-        The numbers, with or without a dimension of episodes.
+        The numbers, with or without the dimension of episodes.
     zeros
         Zeros of the device and type to use, shape (n,).
     dimensions
         How many dimensions the numbers of one episode have, of which the last has the size n.
     shape
         The shape of the numbers of one episode, for an error message.
-
-    Raises
-    ------
-    ValueError
-        If `value` holds no finite numbers, or has a wrong shape.
     """
     values = as_tensor(value, zeros)
     if values is None:

@@ -53,14 +53,7 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
 
 
 class TorchPlants:
-    """Many plants with their actuators in PyTorch, with gradients if the actions have any.
-
-    Parameters
-    ----------
-    parameters
-        The arguments of the environment.
-    episodes
-        The present episodes of the plants, which hold the plant numbers.
+    """n plants with their actuators in PyTorch, with gradients if the actions have any.
 
     Attributes
     ----------
@@ -70,6 +63,7 @@ class TorchPlants:
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
+        """Prepare plants whose numbers, such as delay and dead zone, `episodes` hold."""
         self._episodes = episodes
         self._zeros = episodes.zeros
         self._dynamics = Dynamics(parameters)
@@ -92,28 +86,31 @@ class TorchPlants:
         `age` is the sample k of each plant, shape (n,), or one number for all plants.
         """
         self._outputs.reset(restart)
-        self._flows.extend(torch.stack([*self._flows]).masked_fill_(restart.mask, 0.0).unbind())
+        flows = torch.stack([*self._flows]).masked_fill_(restart.mask, 0.0)
+        self._flows.extend(flows.unbind())  # the deque drops as many old flows
         self._reset_actuator()
         self._reset_delays()
         numbers = PlantNumbers(**self._episodes.numbers)
-        self._initial_factors = self._dynamics.factors(numbers, 0)
+        self._factors: tuple[Number, ...] = self._dynamics.factors(numbers, 0)
         if self._drifts:
             # Gain factor and time constant factor at k = 0, and their total change by drift.
+            self._initial_factors = [self._zeros + initial for initial in self._factors]
             final_factors = self._dynamics.factors(numbers, self._drift_samples)
-            self._drift = [
-                (self._zeros + initial, self._zeros + (final - initial))
-                for initial, final in zip(self._initial_factors, final_factors, strict=True)
+            self._factor_changes = [
+                self._zeros + (final - initial)
+                for initial, final in zip(self._factors, final_factors, strict=True)
             ]
         self._update_dynamics(age)
 
     def _reset_actuator(self) -> None:
-        """Compute what `apply` needs of limits and dead zone, after a reset changed both."""
+        """Compute what `apply` needs of the limits and dead zones of the present episodes."""
         numbers = self._episodes.numbers
         u_min = numbers["u_min"]
         u_max = numbers["u_max"]
         self._limits = u_min, u_max
         self._middle = self._zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
+        # Eight roundings of the type: see `least_effective`.
         rounding = 2.0**-21 if self._zeros.dtype == torch.float32 else 2.0**-50
         self._edge = least_effective(numbers["dead_zone"], u_min, u_max, rounding)
 
@@ -132,17 +129,20 @@ class TorchPlants:
             self._delayed_at = (rows[:, None] + first_rows) * n + columns
 
     def _update_dynamics(self, age: Tensor | int) -> None:
-        """Compute gain, time constant and coefficients of the plants at the sample k = `age`.
+        """Compute the coefficients of equation (28) of the paper at the sample k = `age`.
 
-        `age` has the shape (n,), or is one number for all plants.
+        `age` has the shape (n,), or is one number for all plants. The coefficients change only
+        with drifts, at multiples of `DRIFT_INTERVAL`.
         """
-        self._factors: tuple[Number, ...] = self._initial_factors
         if self._drifts:
             if isinstance(age, Tensor):
                 age = age.to(self._zeros.dtype)
             share = self._dynamics.share(age - age % DRIFT_INTERVAL)
             self._factors = tuple(
-                _add_product(initial, share, change) for initial, change in self._drift
+                _add_product(initial, share, change)
+                for initial, change in zip(
+                    self._initial_factors, self._factor_changes, strict=True
+                )
             )
         coefficients = self._dynamics.coefficients(*self._factors)
         self._alpha, self._scale, self._load_gain = coefficients
@@ -194,6 +194,7 @@ class TorchPlants:
             if first in changes:
                 self._update_dynamics(block.age(first))
             factors += [self._factors] * (end - first)
+            # The temperatures without the terms of earlier temperatures.
             forced = response[first:end]
             if noise is not None:
                 forced = _add_product(noise[first:end], self._scale, forced)
@@ -201,7 +202,8 @@ class TorchPlants:
                 forced = forced * self._scale
             if load is not None:
                 forced = _add_product(forced, self._load_gain, load[first:end])
-            for output in forced.unbind():
+            for forced_row in forced.unbind():
+                output = forced_row
                 for lag, coefficient in enumerate(self._alpha, start=1):
                     output = _add_product(output, coefficient, outputs[-lag])
                 outputs.append(output)

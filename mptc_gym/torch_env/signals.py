@@ -16,20 +16,21 @@ from mptc_gym.torch_env.episodes import Block, Episodes, ExternalValues, History
 
 
 class Noise:
-    """The plant's noise or the transmitter's noise, for many plants; 0 at k = 0.
-
-    Parameters
-    ----------
-    name
-        "noise" for the coloured noise n(k) = C(z^-1) xi(k) of equation (28) of the paper, with
-        white noise xi; or "measurement_noise" for the noise of the transmitter.
-    c
-        The coefficients of C, from z^0 on.
-    episodes
-        The present episodes of the plants, which hold the variance and the generator.
-    """
+    """The plant's noise or the transmitter's noise, for many plants; 0 at k = 0."""
 
     def __init__(self, name: str, c: Sequence[float], episodes: Episodes) -> None:
+        """Prepare the coloured noise C(z^-1) xi(k), degC, with white noise xi.
+
+        Parameters
+        ----------
+        name
+            "noise" for the noise n of equation (28) of the paper, or "measurement_noise" for
+            the noise of the transmitter.
+        c
+            The coefficients of the polynomial C, from z^0 on.
+        episodes
+            The present episodes, which hold the variance and the random number generator.
+        """
         self._variance_name = f"{name}_variance"
         self._c = c
         self._order = len(c) - 1
@@ -69,16 +70,10 @@ class RandomSetPoint:
     Of each plant, the present level and the next level are known. These two levels are enough
     for a block, as no block is longer than the shortest level. Times are counted in samples of
     this signal.
-
-    Parameters
-    ----------
-    levels
-        The ranges from which levels and their lengths are drawn.
-    episodes
-        The present episodes of the plants, which hold the random number generator.
     """
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
+        """Draw from the ranges of levels and lengths in `levels`, from the first reset on."""
         self._distribution = levels
         self._episodes = episodes
         zeros = episodes.zeros
@@ -128,17 +123,10 @@ class RandomSetPoint:
 
 
 class RepeatedSetPoint:
-    """A set point that repeats a sequence of levels, which all plants share.
-
-    Parameters
-    ----------
-    levels
-        The levels, degC, and for how many samples each level holds.
-    episodes
-        The present episodes of the plants.
-    """
+    """A set point that repeats a sequence of levels, which all plants share."""
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:
+        """Take the levels, degC, and for how many samples each level holds from `levels`."""
         self._n = len(episodes.zeros)
         self._levels = episodes.zeros.new_tensor(levels.values)
         # The samples of a period at which the levels end.
@@ -160,12 +148,7 @@ class RepeatedSetPoint:
 class Disturbance:
     """The load disturbance w(k), degC, of many plants: the sum of steps and a random walk.
 
-    The distribution of the load is that of `mptc_gym.plant.signals.Disturbance`.
-
-    Parameters
-    ----------
-    episodes
-        The present episodes of the plants, which hold plant numbers and generator.
+    `mptc_gym.plant.signals.Disturbance` describes the distribution of steps and walk.
     """
 
     def __init__(self, episodes: Episodes) -> None:
@@ -233,16 +216,9 @@ Signal = Noise | RandomSetPoint | RepeatedSetPoint | Disturbance | ExternalValue
 
 
 def make_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
-    """Return the random signals and the set point of an environment, by name.
+    """Return set point, noises and load of an environment, by name, as the arguments say.
 
     A noise or a load that is always 0 is left out.
-
-    Parameters
-    ----------
-    parameters
-        The arguments of the environment.
-    episodes
-        The present episodes of the plants.
     """
     levels = Levels(parameters)
     signals: dict[str, Signal] = {}

@@ -9,17 +9,18 @@ from mptc_gym.torch_env.episodes import History, Restart
 
 
 class Window:
-    """The observations of n plants.
-
-    Parameters
-    ----------
-    windows
-        How many set points, errors, outputs and past actions an observation holds.
-    zeros
-        Zeros of the device and type to use, shape (n,).
-    """
+    """The observations of n plants, computed ahead for a block of samples."""
 
     def __init__(self, windows: Sequence[int], zeros: Tensor) -> None:
+        """Prepare observations of n plants.
+
+        Parameters
+        ----------
+        windows
+            How many set points, errors, outputs and past actions an observation holds.
+        zeros
+            Zeros of the device and type to use, shape (n,).
+        """
         *self._windows, past_actions = windows
         self._zeros = zeros
         # The histories of set points, errors and outputs, degC.
