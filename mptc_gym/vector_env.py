@@ -230,12 +230,12 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return reading
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
-        """Begin an episode of the plants in `mask`; return the infos at k = 0 that are not 0.
+        """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
 
-        The infos are arrays of shape (num_envs,), in which elements of other plants have no
-        meaning.
+        Infos that are always 0 at k = 0 are left out. The infos are arrays of shape
+        (num_envs,), in which elements of other plants have no meaning.
         """
-        which = np.flatnonzero(mask)
+        which = np.flatnonzero(mask)  # the indices of the plants
         numbers = self._ranges.draw([self._streams[i] for i in which.tolist()])
         self._plants.reset(which, numbers)
         setpoint = self._signals.reset(which, self._streams, numbers)

@@ -169,12 +169,12 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         """
         if not self._was_reset:
             raise ResetNeeded("call reset before step")
-        reset_now = self._ended  # in the mode "NextStep"; None for no plant
+        reset_now = self._ended  # plants to reset in the mode "NextStep"; None for no plant
         if reset_now is not None and self.autoreset_mode is AutoresetMode.DISABLED:
             ended_plants = np.flatnonzero(reset_now)
             raise ResetNeeded(f"reset environments {ended_plants}, whose episodes have ended")
         a = self._checked_actions(actions)
-        if reset_now is not None and reset_now.all():
+        if reset_now is not None and reset_now.all():  # no plant moves
             infos = self._begin_episodes(reset_now, {})
             rewards = self._zeros + 0.0  # a copy, as the caller may overwrite the rewards
             terminations = self._as_array(~reset_now)
@@ -306,10 +306,10 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
 
     @abstractmethod
     def _begin(self, mask: Mask) -> dict[str, Array]:
-        """Begin an episode of the plants in `mask`; return the infos at k = 0 that are not 0.
+        """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
 
-        The infos are arrays of shape (num_envs,), in which elements of other plants have no
-        meaning.
+        Infos that are always 0 at k = 0 are left out. The infos are arrays of shape
+        (num_envs,), in which elements of other plants have no meaning.
         """
 
     @abstractmethod

@@ -177,9 +177,9 @@ def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
     for text, parameters_of_plant in zip(texts, parameters, strict=True):
         # An example of a text is "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>". For an
         # environment without an id, it is "<TimeLimit<MiddlePointEnv instance>>".
-        *classes, last = text.strip("<>").split("<")
+        *classes, innermost = text.strip("<>").split("<")
         wrappers = tuple(name for name in classes if name not in _NEUTRAL)
         if isinstance(parameters_of_plant, Parameters):
-            name = last.removesuffix(" instance")
-            groups.append(PlantGroup(parameters_of_plant, 1, name, outer + wrappers))
+            name_of_plant = innermost.removesuffix(" instance")
+            groups.append(PlantGroup(parameters_of_plant, 1, name_of_plant, outer + wrappers))
     return groups

@@ -28,7 +28,7 @@ from mptc_gym.environments.making import make_one
 from mptc_gym.plant.checks import is_count, one_of, reject
 from mptc_gym.plant.dynamics import FACTORS, action_from_command
 from mptc_gym.plant.parameters import ARGUMENTS, spelt_out
-from mptc_gym.plant.signals import FOREVER, Levels
+from mptc_gym.plant.signals import Levels
 from mptc_gym.torch_env.episodes import (
     MOST_BLOCK_SAMPLES,
     SIGNAL_NAMES,
@@ -161,7 +161,7 @@ class MiddlePointTorchEnv(BatchEnv):
         try:
             self.device = torch.device(device)
             self._zeros = torch.zeros(num_envs, dtype=dtype, device=self.device)
-            torch.Generator(self.device)
+            torch.Generator(self.device)  # fails on "meta", which has tensors without values
         except (AssertionError, RuntimeError, TypeError, ValueError) as error:
             reject("device", device, f"a device that PyTorch can use ({error})")
         self.dtype = dtype
@@ -176,7 +176,8 @@ class MiddlePointTorchEnv(BatchEnv):
         self._own_signals = make_signals(self.parameters, self._episodes)
         self._signals = self._own_signals  # own or external signals, by name
         self._external: dict[str, ExternalValues] = {}  # external signals and plant numbers
-        self._last_sample = FOREVER  # the last k for which all external signals have a value
+        # The last k for which all external signals have a value; None without such signals.
+        self._last_sample: int | None = None
         # On a CPU, a block of samples must fit in the processor's cache. On other devices,
         # blocks are as long as possible, since every call of PyTorch takes long.
         self._most_samples = min(MOST_BLOCK_SAMPLES, self._plants.most_samples)
@@ -295,10 +296,10 @@ class MiddlePointTorchEnv(BatchEnv):
         return error.abs().mul_(-1.0 / scale)
 
     def _begin(self, mask: Mask) -> dict[str, Tensor]:
-        """Begin an episode of the plants in `mask`; return the infos at k = 0 that are not 0.
+        """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
 
-        The infos are tensors of shape (num_envs,), in which elements of other plants have no
-        meaning.
+        Infos that are always 0 at k = 0 are left out. The infos are tensors of shape
+        (num_envs,), in which elements of other plants have no meaning.
         """
         restart = Restart(self._as_array(mask), unused_rows=len(self._ahead))
         if mask.all():
@@ -348,17 +349,17 @@ class MiddlePointTorchEnv(BatchEnv):
         """
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
             reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
-        if "reset_mask" in options:
-            if "signals" in options:
-                raise ValueError("options['signals'] needs a reset of all plants, without mask")
-        else:
+        if "reset_mask" in options and "signals" in options:
+            raise ValueError("options['signals'] needs a reset of all plants, without mask")
+        if "reset_mask" not in options:  # external signals last until the next such reset
             self._external = read_external(options.get("signals"), self.parameters, self._zeros)
             self._signals = {**self._own_signals}
-            self._last_sample = FOREVER
+            last_samples: list[int] = []
             for name, values in self._external.items():
                 if name in SIGNAL_NAMES:
                     self._signals[name] = values
-                    self._last_sample = min(self._last_sample, values.last_sample)
+                    last_samples.append(values.last_sample)
+            self._last_sample = min(last_samples, default=None)
         if seed is not None:
             self._episodes.generator.manual_seed(int(seed))
         self._np_random_seed = self._episodes.generator.initial_seed()
@@ -369,14 +370,14 @@ class MiddlePointTorchEnv(BatchEnv):
         A ValueError is raised if the actions do not have the shape (num_envs, 1), if an action
         is not finite (on the CPU), or if an external signal has ended.
         """
-        columns = actions
+        column = actions
         if not (isinstance(actions, Tensor) and actions.dtype is self.dtype):
-            columns = as_tensor(actions, self._zeros)
-        if columns is None or columns.shape != (self.num_envs, 1):
+            column = as_tensor(actions, self._zeros)
+        if column is None or column.shape != (self.num_envs, 1):
             reject("actions", actions, f"numbers, shape ({self.num_envs}, 1)")
-        if columns.requires_grad and not self.differentiable:
-            columns = columns.detach()
-        a: Tensor = columns.reshape(-1)
+        if column.requires_grad and not self.differentiable:
+            column = column.detach()
+        a: Tensor = column.reshape(-1)
         if self._ended is not None:
             a = a.masked_fill(self._as_array(self._ended), 0.0)
         if self.checks_actions:
@@ -385,19 +386,19 @@ class MiddlePointTorchEnv(BatchEnv):
             values = a.detach()
             if not math.isfinite(values.dot(values).item()) and not values.isfinite().all():
                 reject("actions", actions, "finite")
-        if self._last_sample < FOREVER:
-            self._check_signals_last()
+        if self._last_sample is not None:
+            self._check_signals_go_on(self._last_sample)
         return a
 
-    def _check_signals_last(self) -> None:
-        """Raise a ValueError if the coming step leads beyond the end of an external signal."""
+    def _check_signals_go_on(self, last_sample: int) -> None:
+        """Raise a ValueError if the next step of some plant leads beyond k = `last_sample`."""
         ages = self._clock - self._starts
         if self._ended is not None:  # the step resets these plants
             ages = ages[~self._ended]
-        if len(ages) and ages.max() >= self._last_sample:
+        if len(ages) and ages.max() >= last_sample:
             raise ValueError(
-                f"options['signals'] end at sample {self._last_sample} of an episode, and "
-                "the step leads to a later sample"
+                f"options['signals'] end at sample {last_sample} of an episode, and the step "
+                "leads to a later sample"
             )
 
 

@@ -87,9 +87,9 @@ class History:
         self.rows = [*self.rows[len(self.rows) - self._length :], *block]
 
     def reset(self, restart: Restart, newest: Tensor | None = None) -> None:
-        """Drop the unused rows of the block, and set the values of restarted plants to zero.
+        """Drop the unused rows, and set the values of the plants in `restart.mask` to zero.
 
-        `newest` replaces the zeros at sample k = 0, shape (n,).
+        If `newest`, shape (n,), is given, these plants have the values `newest` at k = 0.
         """
         end = len(self.rows) - restart.unused_rows
         rows = self.rows[end - self._length : end]
@@ -155,7 +155,7 @@ class Episodes:
         Parameters
         ----------
         restart
-            The plants whose episode begins.
+            Which plants begin an episode.
         time
             The present time, in steps of the environment.
         starts
@@ -185,7 +185,10 @@ class Episodes:
         return numbers
 
     def block(self, first_time: int, samples: int) -> Block:
-        """Return the block of `samples` samples from the time `first_time` on."""
+        """Return the block of `samples` samples from the time `first_time` on.
+
+        The block also lists the rows at which the load or the dynamics of some plant change.
+        """
         due_rows = [
             row
             for row in range(samples)
@@ -233,7 +236,10 @@ class ExternalValues:
         self.last_sample = values.shape[1] - 1
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin the next episode of some plants, and return the values at k = 0, shape (n,)."""
+        """Begin the next episode of the plants in `restart.mask`; return values at k = 0.
+
+        The values have the shape (n,).
+        """
         self._episode = self._episode + restart.mask
         return self._at(torch.zeros_like(self._episode)[None])[0]
 
@@ -247,8 +253,10 @@ class ExternalValues:
         `ages` are the samples k, of shape (samples, n), or (samples, 1) for all plants.
         """
         episodes, samples, _ = self._values.shape
-        rows = self._episode % episodes * samples + ages.clamp(max=samples - 1)
-        return self._values.flatten(0, 1).gather(0, rows)
+        # With episodes and samples as one axis, an episode begins every `samples` rows.
+        values = self._values.flatten(0, 1)
+        first_rows = (self._episode % episodes) * samples
+        return values.gather(0, first_rows + ages.clamp(max=samples - 1))
 
 
 def read_external(

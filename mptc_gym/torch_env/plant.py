@@ -81,9 +81,10 @@ class TorchPlants:
         self._outputs = History(self._zeros, len(parameters.a) - 1)
 
     def reset(self, restart: Restart, age: Tensor | int) -> None:
-        """Bring some plants to rest, with the plant numbers of the present episodes.
+        """Bring the plants in `restart.mask` to rest, with the plant numbers of a new episode.
 
-        `age` is the sample k of each plant, shape (n,), or one number for all plants.
+        Plant numbers are delay, dead zone, limits, gain and so on. `age` is the sample k of
+        each plant, shape (n,), or one number for all plants.
         """
         self._outputs.reset(restart)
         flows = torch.stack([*self._flows]).masked_fill_(restart.mask, 0.0)
@@ -115,9 +116,10 @@ class TorchPlants:
         self._edge = least_effective(numbers["dead_zone"], u_min, u_max, rounding)
 
     def _reset_delays(self) -> None:
-        """Compute where each plant's delayed flows are in all flows, if the delays differ.
+        """Compute the indices at which `_response` finds the delayed flows of each plant.
 
-        `_delayed_at` holds the indices in the flattened flows of `_response`.
+        The indices, shape (rows, n), refer to the flows of all plants in one flat tensor. They
+        are None if all plants have the same delay.
         """
         self._delayed_at: Tensor | None = None
         delay = self._episodes.numbers["delay"]
@@ -131,8 +133,9 @@ class TorchPlants:
     def _update_dynamics(self, age: Tensor | int) -> None:
         """Compute the coefficients of equation (28) of the paper at the sample k = `age`.
 
-        `age` has the shape (n,), or is one number for all plants. The coefficients change only
-        with drifts, at multiples of `DRIFT_INTERVAL`.
+        These are the factors of past temperatures, of past flows and of the load. `age` has the
+        shape (n,), or is one number for all plants. If gain and time constant drift, the
+        coefficients change at multiples of `DRIFT_INTERVAL`.
         """
         if self._drifts:
             if isinstance(age, Tensor):
@@ -187,11 +190,11 @@ class TorchPlants:
         outputs = [*self._outputs.rows]
         factors: list[tuple[Number, ...]] = []
         response = self._response(block.samples)
-        changes = block.due_rows if self._drifts else []
+        rows_of_change = block.due_rows if self._drifts else []
         # Between two of these rows of the block, the coefficients are constant.
-        boundaries = sorted({0, *changes, block.samples})
+        boundaries = sorted({0, *rows_of_change, block.samples})
         for first, end in pairwise(boundaries):
-            if first in changes:
+            if first in rows_of_change:
                 self._update_dynamics(block.age(first))
             factors += [self._factors] * (end - first)
             # The temperatures without the terms of earlier temperatures.
@@ -222,13 +225,14 @@ class TorchPlants:
         The part at sample k is B(z^-1) u_a(k-d), with the polynomial B of equation (28) of the
         paper, applied flow u_a and delay d. `samples` is the number of samples in the block.
         """
-        # One delayed flow for each sample, and earlier flows for the further terms of B.
+        # One delayed flow for each sample, and before them the flows for further terms of B.
         rows = samples + len(self._beta) - 1
         if self._delayed_at is None:
             delayed_flows = torch.stack([*islice(self._flows, rows)])
         else:
-            difference_of_delays = self._longest_delay - self.most_samples + 1
-            all_flows = torch.stack([*islice(self._flows, difference_of_delays + rows)])
+            shortest_delay = self.most_samples - 1
+            rows_of_all = rows + self._longest_delay - shortest_delay
+            all_flows = torch.stack([*islice(self._flows, rows_of_all)])
             indices = self._delayed_at[:rows].reshape(-1)
             delayed_flows = all_flows.reshape(-1).index_select(0, indices).view(rows, -1)
         response = delayed_flows[-samples:] * self._beta[0]

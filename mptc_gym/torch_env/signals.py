@@ -40,7 +40,7 @@ class Noise:
         self._xi = episodes.zeros.expand(self._order, -1)
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin an episode of some plants, and return zeros, shape (n,)."""
+        """Begin an episode of the plants in `restart.mask`; return zeros, shape (n,)."""
         self._deviation = self._episodes.numbers[self._variance_name] ** 0.5
         used_rows = self._xi[: len(self._xi) - restart.unused_rows]
         self._xi = used_rows.masked_fill(restart.mask, 0.0)
@@ -85,7 +85,7 @@ class RandomSetPoint:
         self._next_level_end = self._level_end
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin an episode of some plants; return the set points y_d(0), degC, shape (n,)."""
+        """Begin an episode of the plants in `restart.mask`; return y_d(0), degC, shape (n,)."""
         self._time -= restart.unused_rows
         self._forget_past_levels()
         levels, lengths = self._draw()
@@ -99,6 +99,7 @@ class RandomSetPoint:
         last_time = self._time + block.samples
         if last_time > self._known_until:
             self._forget_past_levels()
+            # The next level holds at least as long as the shortest level.
             self._known_until = self._time + self._distribution.shortest
             self._next_level, lengths = self._draw()
             self._next_level_end = self._level_end + lengths
@@ -158,7 +159,7 @@ class Disturbance:
         self._walk = History(episodes.zeros, 1)
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin an episode of some plants, with a load of 0; return zeros, shape (n,)."""
+        """Begin an episode, with a load of 0, of the plants in `restart.mask`; return zeros."""
         self._steps.reset(restart)
         self._walk.reset(restart)
         return self._episodes.zeros

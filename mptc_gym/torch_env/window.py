@@ -31,7 +31,7 @@ class Window:
         self._ahead: list[Tensor] = []
 
     def reset(self, restart: Restart, setpoint: Tensor, rest_action: Tensor) -> None:
-        """Begin an episode of some plants, at rest.
+        """Set the observations of the plants in `restart.mask` to those of a plant at rest.
 
         `setpoint` are set points y_d(0), degC, and `rest_action` the actions for a flow of 0
         t/h, both of shape (n,).
@@ -82,7 +82,7 @@ class Window:
         Past actions are left out. The first of the `samples` observations begins at index
         `first_place` of the histories.
         """
-        newest_first: list[Tensor] = []
+        newest_first: list[Tensor] = []  # the elements of all observations, shape (n,) each
         for place in range(first_place, first_place + samples):
             for history, window in zip(self._histories, self._windows, strict=True):
                 newest_first += history.rows[place : place + window][::-1]

@@ -104,10 +104,10 @@ class IncrementalAction(VectorActionWrapper):
         return returned
 
     def _begin_episodes(self, mask: NDArray[np.bool_], infos: dict[str, Any]) -> None:
-        """Set the wanted flows of the plants in `mask` to 0, and read their actuators in infos.
+        """Set the wanted flows of the plants in `mask`, shape (num_envs,), to 0 t/h.
 
-        `mask` has the shape (num_envs,). `infos` holds the dead zones and limits that the reset
-        drew for these plants.
+        If dead zones or limits are random, their new values are taken from the infos of the
+        reset.
         """
         for name in {*ACTUATOR_NUMBERS} & {*infos}:
             self._numbers[name][mask] = infos[name][mask]
