@@ -74,8 +74,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     random set point changes. The memory that a plant needs, a few KiB, does not grow with the
     length of an episode.
 
-    With an unstable `a`, or with actions beyond 1e154, the temperature may overflow. NumPy
-    then warns, while `MiddlePointEnv` continues without a warning.
+    With an unstable `a`, or with actions beyond 1e154, the temperature may overflow, of which
+    NumPy warns; `MiddlePointEnv` gives no warning.
     """
 
     metadata: dict[str, Any] = MiddlePointEnv.metadata | {"render_modes": ["rgb_array"]}
@@ -216,8 +216,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _readings(self, output: Values) -> Values:
         """Return the transmitter's readings of the temperatures `output`, degC, shape (n,).
 
-        Readings have noise and saturate at +-`temperature_span`. Where neither changes a
-        temperature, the result is `output` itself.
+        Readings have noise and saturate at +-`temperature_span`. Without noise and saturation,
+        the result is the array `output` itself.
         """
         reading = output
         if self._signals.measurement_noise is not None:
@@ -326,8 +326,7 @@ class _Window:
     An observation has four blocks: set points, errors, outputs and past actions, each with the
     newest sample first. The observations of all plants follow each other in one row of memory.
     At each step, the place in the row at which the first observation begins moves back by one
-    element. So all samples move on by one place in their observation without being copied, and
-    only the newest sample of each block has to be written.
+    element, which makes room for a new sample at the head of every block without any copying.
 
     Parameters
     ----------
@@ -338,16 +337,16 @@ class _Window:
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
-        heads = np.cumsum([0, *windows[:-1]]).tolist()
-        # Indices of the newest sample of each block in all observations; None for a block of
-        # size 0.
-        self._setpoints, self._errors, self._outputs, self._actions = (
-            np.s_[:, head] if window else None
-            for head, window in zip(heads, windows, strict=True)
-        )
-        self._all_actions = np.s_[:, heads[-1] :]
-        self._shape = num_envs, sum(windows)
-        self._elements = num_envs * sum(windows)
+        # For each block, the index of its newest sample in the observations of all plants; None
+        # for a block of size 0.
+        self._newest: list[tuple[slice, int] | None] = []
+        size = 0
+        for window in windows:
+            self._newest.append(np.s_[:, size] if window else None)
+            size += window
+        self._past_actions = np.s_[:, size - windows[-1] :]
+        self._shape = num_envs, size
+        self._elements = num_envs * size
         self._row = np.zeros(self._elements + STEPS_PER_SHIFT, np.float32)
         self._place = STEPS_PER_SHIFT  # index in the row at which the first observation begins
 
@@ -373,11 +372,13 @@ class _Window:
             plants.
         """
         observations = np.zeros((len(which), self._shape[1]), np.float32)
-        observations[self._all_actions] = np.reshape(np.clip(rest_action, -1.0, 1.0), (-1, 1))
-        if self._setpoints is not None:
-            observations[self._setpoints] = setpoint
-        if self._errors is not None:
-            observations[self._errors] = setpoint
+        observed_action = np.clip(rest_action, -1.0, 1.0)
+        observations[self._past_actions] = np.reshape(observed_action, (-1, 1))
+        setpoints, errors, _, _ = self._newest
+        if setpoints is not None:
+            observations[setpoints] = setpoint
+        if errors is not None:
+            observations[errors] = setpoint  # the temperature is 0
         self._view()[which] = observations
 
     def add(
@@ -393,12 +394,13 @@ class _Window:
             self._place = STEPS_PER_SHIFT
         self._place -= 1
         observations = self._view()
-        if self._setpoints is not None:
-            observations[self._setpoints] = setpoint
-        if self._errors is not None:
-            observations[self._errors] = error
-        if self._outputs is not None:
-            observations[self._outputs] = output
-        if self._actions is not None:
-            observations[self._actions] = action.clip(-1.0, 1.0)
+        setpoints, errors, outputs, actions = self._newest
+        if setpoints is not None:
+            observations[setpoints] = setpoint
+        if errors is not None:
+            observations[errors] = error
+        if outputs is not None:
+            observations[outputs] = output
+        if actions is not None:
+            observations[actions] = action.clip(-1.0, 1.0)
         return observations.copy()

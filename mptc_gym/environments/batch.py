@@ -120,7 +120,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             the plant's last observation.
         infos : dict
             The infos, in arrays of shape (num_envs,), and the masks of the infos, which are
-            False for plants that are not reset. Several masks may be the same array.
+            False for plants that are not reset. Masks of several infos may be one array.
 
         Raises
         ------
@@ -156,7 +156,7 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
             (num_envs,). No episode terminates; the time limit truncates episodes.
         infos : dict
             The infos at sample k+1, in arrays of shape (num_envs,), and the masks of the infos.
-            Several masks may be the same array.
+            Masks of several infos may be one array.
 
         Raises
         ------
@@ -222,8 +222,8 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         mask
             The plants.
         infos
-            The infos of a step, in which only the elements of these plants are replaced, or an
-            empty dict. This dict is filled and returned.
+            The infos of a step, of which only the elements of these plants are replaced, or an
+            empty dict. The dict that is returned is this dict.
         """
         self._starts[mask] = self._clock
         self._next_end = int(self._starts.min()) + self._episode_length
@@ -248,7 +248,8 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         -------
         PlantState
             Delay (samples), dead zone (t/h), gain (degC per t/h), time constant (s) and load
-            (degC), each of shape (num_envs,). Gain and time constant include drift so far.
+            (degC), each of shape (num_envs,). Gain and time constant include the drift up to
+            the present sample.
 
         Raises
         ------

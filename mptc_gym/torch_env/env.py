@@ -48,7 +48,7 @@ _NUMBERS_IN_CACHE = 1 << 17
 
 
 class _Step(NamedTuple):
-    """What `step` returns of a sample, except what depends on the latest actions."""
+    """What `step` will return for a sample, as far as known before the action of the step."""
 
     rewards: Tensor  # without the cost of moves, shape (n,)
     terminations: Tensor  # shape (n,)
@@ -81,7 +81,7 @@ class MiddlePointTorchEnv(BatchEnv):
         The spaces are always float32.
     differentiable
         Whether observations, rewards and infos carry PyTorch's gradient graph back to the
-        actions of the present and of earlier steps; see Gradients.
+        actions of the present and of earlier steps; see the note on gradients.
     **arguments
         The arguments of `MiddlePointEnv` except `render_mode`. All plants have the same
         arguments, but where an argument is a range, every plant draws its own number.
@@ -91,7 +91,7 @@ class MiddlePointTorchEnv(BatchEnv):
     autoreset_mode : AutoresetMode
         When the plant of an ended episode is reset: see `MiddlePointVectorEnv`.
     checks_actions : bool
-        Whether `step` refuses actions that are not finite; see Waiting.
+        Whether `step` refuses actions that are not finite; see the note on waiting.
 
     Raises
     ------
@@ -206,9 +206,8 @@ class MiddlePointTorchEnv(BatchEnv):
         """Cut the gradient graph to earlier actions, for truncated backpropagation.
 
         The tensors that later steps return then depend only on actions after the call of
-        `detach`. The tensors that earlier steps have returned stay attached to the graph. So
-        also detach the latest observation before the policy sees this observation: otherwise
-        the next action depends on earlier actions through the observation.
+        `detach`. The tensors that earlier steps have returned stay attached to the graph:
+        detach the latest observation, too, before the policy sees it.
         """
         self._plants.detach()
         self._window.detach()
@@ -417,8 +416,8 @@ def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePoint
     Returns
     -------
     MiddlePointTorchEnv
-        The plants. Their `spec` stands for one of these plants in NumPy, as in
-        `mptc_gym.evaluate(policy, plants.spec)`.
+        The plants. The `spec` of the environment describes one plant in NumPy, as
+        `mptc_gym.evaluate(policy, envs.spec)` needs.
 
     Raises
     ------

@@ -216,8 +216,8 @@ class Episodes:
 class ExternalValues:
     """A signal, or a plant number, that is read from a tensor instead of being random.
 
-    After the last episode in the tensor, the first episode follows again. After the last sample
-    of an episode, the value of this sample is held.
+    After its last episode, the tensor is read from its first episode on again. After the last
+    sample of an episode in the tensor, a signal keeps its last value.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ class ExternalValues:
     def __init__(self, values: Tensor) -> None:
         """Store values, degC, of a signal of n plants, shape (episodes, samples, n).
 
-        A plant number, in the unit of its argument, has one sample.
+        A plant number, such as a delay, is a signal of one sample in the number's own unit.
         """
         self._values = values
         # The index of each plant's present episode, shape (n,).

@@ -58,8 +58,8 @@ class TorchPlants:
     Attributes
     ----------
     most_samples : int
-        The most samples in a block: d + 1, with d the shortest delay that can be drawn. No
-        later action affects the temperatures of the d + 1 samples after an action.
+        The most samples in a block: d + 1, with d the shortest delay that can be drawn. The
+        temperatures of the d + 1 samples after an action do not depend on later actions.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
@@ -118,8 +118,8 @@ class TorchPlants:
     def _reset_delays(self) -> None:
         """Compute the indices at which `_response` finds the delayed flows of each plant.
 
-        The indices, shape (rows, n), refer to the flows of all plants in one flat tensor. They
-        are None if all plants have the same delay.
+        The indices, shape (rows, n), refer to the flows of all plants in one flat tensor.
+        Without random delays, `_response` needs no indices.
         """
         self._delayed_at: Tensor | None = None
         delay = self._episodes.numbers["delay"]
@@ -131,11 +131,11 @@ class TorchPlants:
             self._delayed_at = (rows[:, None] + first_rows) * n + columns
 
     def _update_dynamics(self, age: Tensor | int) -> None:
-        """Compute the coefficients of equation (28) of the paper at the sample k = `age`.
+        """Compute the factors of past temperatures, past flows and load at sample k = `age`.
 
-        These are the factors of past temperatures, of past flows and of the load. `age` has the
-        shape (n,), or is one number for all plants. If gain and time constant drift, the
-        coefficients change at multiples of `DRIFT_INTERVAL`.
+        The factors are the coefficients of equation (28) of the paper. If gain and time
+        constant drift, the factors change at multiples of `DRIFT_INTERVAL`. `age` has the shape
+        (n,), or is one number for all plants.
         """
         if self._drifts:
             if isinstance(age, Tensor):

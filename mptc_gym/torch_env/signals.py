@@ -67,9 +67,8 @@ class Noise:
 class RandomSetPoint:
     """A set point of random levels, each level held for a random number of samples.
 
-    Of each plant, the present level and the next level are known. These two levels are enough
-    for a block, as no block is longer than the shortest level. Times are counted in samples of
-    this signal.
+    The present and the next level of each plant are enough for a block of samples, as no block
+    is longer than the shortest level. Times are counted in samples of the signal.
     """
 
     def __init__(self, levels: Levels, episodes: Episodes) -> None:

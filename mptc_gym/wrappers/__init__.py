@@ -62,8 +62,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         above 0, up to 2.
     compensate_dead_zone
         False leaves the dead zone as it is. True compensates the dead zone of the plant, or of
-        the present episode if `dead_zone` is a range. A number compensates a dead zone with
-        this number as half width, t/h.
+        the present episode if `dead_zone` is a range. A number is the half width, t/h, of the
+        dead zone to compensate.
 
     Attributes
     ----------
@@ -73,8 +73,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     Raises
     ------
     ValueError
-        If an argument is out of range. Also raised by `step`, if the action is not one finite
-        number; this error leaves the wrapper and the environment unchanged.
+        If an argument is out of range. `step` raises a ValueError if the action is not one
+        finite number, and leaves the wrapper and the environment unchanged.
 
     Examples
     --------
@@ -181,8 +181,8 @@ class Actuator:
         """Return the change of the commanded flow per change of the wanted flow, as a ratio.
 
         `limit` is the magnitude of the limit towards which the flow moves, t/h. For a limit
-        inside the dead zone, the ratio is 0: every command is then on the edge of the dead
-        zone, which the actuator, equation (29) of the paper, limits to this limit.
+        inside the dead zone, the ratio is 0: every command is then at the edge of the dead
+        zone, beyond the limit, and the actuator applies the limit itself.
         """
         return np.maximum(limit - self._zone, 0.0) / np.where(limit > 0.0, limit, 1.0)
 

@@ -20,7 +20,8 @@ class IncrementalAction(VectorActionWrapper):
     """The action changes the flow: `mptc_gym.wrappers.IncrementalAction` for many plants.
 
     `reset` and `step` return the same as `mptc_gym.wrappers.IncrementalAction` around each
-    single environment. All three autoreset modes, and resets of some of the plants, work.
+    single environment. The wrapper supports all three autoreset modes, and resets of only some
+    plants.
 
     Parameters
     ----------
@@ -33,8 +34,8 @@ class IncrementalAction(VectorActionWrapper):
     Raises
     ------
     ValueError
-        If `env` is of another kind or an argument is out of range. Also raised by `step`, if
-        actions are not finite numbers of shape (num_envs, 1).
+        If `env` holds no `MiddlePointEnv` in NumPy, or if an argument is out of range. `step`
+        raises a ValueError if actions are not finite numbers of shape (num_envs, 1).
     """
 
     def __init__(
