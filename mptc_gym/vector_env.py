@@ -115,8 +115,6 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._zeros = np.zeros(num_envs)
         self._all_true = np.ones(num_envs, np.bool_)
         self._all_false = np.zeros(num_envs, np.bool_)
-        self._highest_reading = np.full(num_envs, parameters.temperature_span)
-        self._lowest_reading = -self._highest_reading
         self._error_scale = np.array(parameters.error_scale)
         self._minus_half = np.array(-0.5)
 
@@ -224,9 +222,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             reading = output + self._signals.measurement_noise.next()
         # One test for all plants, which is fast: if the sum of the squared readings is at most
         # the squared span, no reading is beyond the span.
-        if not reading.dot(reading) <= self.parameters.temperature_span**2:
-            reading = np.fmin(reading, self._highest_reading)  # NaN becomes the highest reading
-            np.fmax(reading, self._lowest_reading, out=reading)
+        span = self.parameters.temperature_span
+        if not reading.dot(reading) <= span * span:
+            reading = np.fmin(reading, span)  # NaN becomes the highest reading
+            np.fmax(reading, -span, out=reading)
         return reading
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:

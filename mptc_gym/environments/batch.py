@@ -72,8 +72,9 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         if not is_count(limit, -1) or limit == 0:
             allowed = "an integer of at least 1, or None or -1 for no limit"
             reject("max_episode_steps", max_episode_steps, allowed)
-        # Samples after which an episode is truncated.
-        self._episode_length = FOREVER if limit == -1 else min(FOREVER, int(limit))
+        self._episode_length = FOREVER  # samples after which an episode is truncated
+        if limit != -1:
+            self._episode_length = min(FOREVER, int(limit))
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -135,8 +136,8 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         if not self._was_reset and not mask.all():
             raise ResetNeeded("the first reset must include all environments")
         self._prepare(mask, seed, options or {})
-        self._was_reset = True
         infos = self._begin_episodes(mask, {})
+        self._was_reset = True
         return self._window.present(), infos
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
@@ -222,8 +223,8 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         mask
             The plants.
         infos
-            The infos of a step, of which only the elements of these plants are replaced, or an
-            empty dict. The dict that is returned is this dict.
+            The infos of a step, or an empty dict. In this dict, which is also returned, the
+            elements of other plants stay the same.
         """
         self._starts[mask] = self._clock
         self._next_end = int(self._starts.min()) + self._episode_length
@@ -239,10 +240,10 @@ class BatchEnv(HasPlainSpec, VectorEnv[Array, Array, Array], ABC):
         return infos
 
     def plant_state(self) -> PlantState:
-        """Return what a teacher in training may know of each plant at the present sample.
+        """Return the present state of the plants, which no policy can observe.
 
-        A policy cannot observe the state; a critic or a teacher may use it in training. The
-        present sample is that of the observations which `step` or `reset` returned last.
+        In training, a critic or a teacher may use the state. The state belongs to the same
+        sample as the observations that `step` or `reset` has just returned.
 
         Returns
         -------

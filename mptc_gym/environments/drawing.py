@@ -241,8 +241,8 @@ def _draw_flows(surface: pygame.Surface, record: Record) -> None:
     panel.shade(IN_TRANSIT, record.k - int(plant.delay), record.k, lowest, highest)
     for limit in (plant.u_min, plant.u_max):
         panel.horizontal_line(LIMIT, limit)
-    # A sample k holds the flows of the step from sample k-1 to k, so these flows begin at
-    # sample k-1 in the picture. The flows of the oldest sample would begin before the picture.
+    # A sample k holds the flows from sample k-1 to k, so each flow is drawn from sample k-1 on,
+    # and the newest flow holds up to sample k. The oldest flow would begin before the picture.
     applied = [sample.applied for sample in record.samples]
     commands = [sample.command for sample in record.samples]
     panel.curve(APPLIED, [*applied[1:], applied[-1]], 3, is_staircase=True)

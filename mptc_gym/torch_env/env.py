@@ -275,9 +275,9 @@ class MiddlePointTorchEnv(BatchEnv):
             infos_of_block["time_constant_factor"] = time_constant_factors
 
         rewards = self._rewards(error).unbind()
-        flags = self._zeros.new_zeros(2, samples, self.num_envs, dtype=torch.bool)
-        terminations = flags[0].unbind()
-        truncations = flags[1].unbind()
+        flags = self._zeros.new_zeros(2 * samples, self.num_envs, dtype=torch.bool).unbind()
+        terminations = flags[:samples]
+        truncations = flags[samples:]
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         masks = {f"_{name}": everyone for name in self._info_names}
         for k in reversed(range(samples)):
@@ -382,7 +382,9 @@ class MiddlePointTorchEnv(BatchEnv):
         if self.checks_actions:
             # The sum of squares, which is fast, is finite if all actions are finite and none is
             # huge.
-            values = a.detach()
+            values = a
+            if a.requires_grad:
+                values = a.detach()
             if not math.isfinite(values.dot(values).item()) and not values.isfinite().all():
                 reject("actions", actions, "finite")
         if self._last_sample is not None:

@@ -68,7 +68,6 @@ class TorchPlants:
         self._zeros = episodes.zeros
         self._dynamics = Dynamics(parameters)
         self._drifts = parameters.drifts
-        self._changes_dynamics = parameters.changes_dynamics
         self._drift_samples = parameters.drift_samples
         self._beta = tuple(parameters.b)
         shortest_delay, self._longest_delay = map(int, parameters.range_of("delay"))
@@ -111,8 +110,8 @@ class TorchPlants:
         self._limits = u_min, u_max
         self._middle = self._zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
-        # Eight roundings of the type: see `least_effective`.
-        rounding = 2.0**-21 if self._zeros.dtype == torch.float32 else 2.0**-50
+        # Eight roundings, each of half an eps: see `least_effective`.
+        rounding = 4.0 * torch.finfo(self._zeros.dtype).eps
         self._edge = least_effective(numbers["dead_zone"], u_min, u_max, rounding)
 
     def _reset_delays(self) -> None:
@@ -201,7 +200,7 @@ class TorchPlants:
             forced = response[first:end]
             if noise is not None:
                 forced = _add_product(noise[first:end], self._scale, forced)
-            elif self._changes_dynamics:
+            else:
                 forced = forced * self._scale
             if load is not None:
                 forced = _add_product(forced, self._load_gain, load[first:end])

@@ -21,11 +21,11 @@ class Window:
         zeros
             Zeros of the device and type to use, shape (n,).
         """
-        *self._windows, past_actions = windows
+        *self._windows, self._past_actions = windows
         self._zeros = zeros
         # The histories of set points, errors and outputs, degC.
         self._histories = [History(zeros, window) for window in self._windows]
-        self._actions = zeros.expand(past_actions, -1)  # past actions, the newest first
+        self._actions = zeros.expand(self._past_actions, -1)  # past actions, the newest first
         # Observations of the rest of the block, without past actions, shape (size, n), the next
         # sample last.
         self._ahead: list[Tensor] = []
@@ -59,7 +59,7 @@ class Window:
         `actions`, shape (n,), are the actions that led to this sample.
         """
         observations = self._ahead.pop()
-        if len(self._actions):
+        if self._past_actions:
             newest = actions.clamp(-1.0, 1.0)[None]
             self._actions = torch.cat((newest, self._actions))[:-1]
             observations = torch.cat((observations, self._actions))
