@@ -76,9 +76,9 @@ class IncrementalAction(VectorActionWrapper):
         """
         # The mask is read before the reset, in which Gymnasium's vector environments remove the
         # mask from the options.
-        mask = options.get("reset_mask") if isinstance(options, Mapping) else None
-        if mask is None:
-            mask = np.ones(self.num_envs, np.bool_)
+        mask = np.ones(self.num_envs, np.bool_)
+        if isinstance(options, Mapping) and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])  # of an array or a tensor
         observations, infos = self.env.reset(seed=seed, options=options)
         self._begin_episodes(mask, infos)
         return observations, infos
