@@ -24,10 +24,9 @@ from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
 
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 
-# Most bytes for a block of noise, 128 MiB, unless a single sample of all plants takes more.
-NOISE_BYTES = 1 << 27
-# Steps after which the observations are moved back in memory: rare moves take little time, and
-# 64 further elements take little memory.
+NOISE_BYTES = 1 << 27  # most bytes for a block of noise: 128 MiB
+# Steps after which all observations are moved in memory: so rarely that the moves take little
+# time. The memory for them is one element a step.
 STEPS_PER_SHIFT = 64
 
 
@@ -46,10 +45,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         Samples after which an episode is truncated; None or -1 for no limit.
     autoreset_mode
         An `AutoresetMode` or its value. "NextStep": the step after the end of an episode resets
-        the plant, and the action of this step is ignored. "SameStep": the step that ends an
-        episode resets the plant, and the infos of this step hold the last observation and info
-        of the episode as `final_obs` and `final_info`. "Disabled": the caller resets plants
-        whose episode has ended, with `reset(options={"reset_mask": mask})`.
+        the plant, and ignores the plant's action. "SameStep": the step that ends an episode
+        also resets the plant; `final_obs` and `final_info` in the infos hold the last
+        observation and info of the episode. "Disabled": the caller resets plants whose episode
+        has ended, with `reset(options={"reset_mask": mask})`.
     render_mode
         None, or "rgb_array": `render` returns a picture of each plant.
     **arguments
@@ -70,14 +69,13 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     the next episode of the plant's present streams begins. Rewards are float64, and
     observations float32.
 
-    All plants share one clock, so that a step is array arithmetic alone. There is a Python loop
-    over plants only where every plant draws from its own generators: at the start of an
-    episode, once every 600 samples or so of noise, and when a random set point changes. The
-    memory that a plant needs, a few KiB, does not grow with the length of an episode.
+    A step is array arithmetic alone, except where every plant draws from its own random number
+    generators: at the start of an episode, once every 600 samples or so of noise, and when a
+    random set point changes. The memory that a plant needs, a few KiB, does not grow with the
+    length of an episode.
 
-    With an unstable `a`, or with actions beyond 1e154, the temperature may overflow. NumPy
-    warns of an overflow in `MiddlePointVectorEnv`, while `MiddlePointEnv` continues without a
-    warning.
+    With an unstable `a`, or with actions beyond 1e154, the temperature may overflow, of which
+    NumPy warns; `MiddlePointEnv` gives no warning.
     """
 
     metadata: dict[str, Any] = MiddlePointEnv.metadata | {"render_modes": ["rgb_array"]}
@@ -92,6 +90,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
+        """Prepare the plants; the docstring of the class describes the arguments."""
         one_of("render_mode", render_mode, [None, "rgb_array"])
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
         parameters = self.parameters
@@ -104,8 +103,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._plant_sampler = PlantSampler(parameters)
         # Blocks of noise end with an episode, so that no noise is generated in vain. Where many
         # plants would need much memory, the blocks are shorter, which is slower.
-        longest = max(1, min(SAMPLES_AT_A_TIME, NOISE_BYTES // (8 * num_envs)))
-        block = math.ceil(self._limit / math.ceil(self._limit / longest))
+        most_samples = max(1, min(SAMPLES_AT_A_TIME, NOISE_BYTES // (8 * num_envs)))
+        blocks_per_episode = math.ceil(self._episode_length / most_samples)
+        block = math.ceil(self._episode_length / blocks_per_episode)
         self._signals = Signals.of(parameters, num_envs, block)
         self._plants = PlantBatch(parameters, num_envs)
         self._window = _Window(parameters.windows, num_envs)
@@ -115,11 +115,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._zeros = np.zeros(num_envs)
         self._all_true = np.ones(num_envs, np.bool_)
         self._all_false = np.zeros(num_envs, np.bool_)
-        span = parameters.temperature_span
-        self._span = np.full(num_envs, -span), np.full(num_envs, span), span * span
-        quadratic = parameters.reward == "quadratic"
-        error_scale = np.array(parameters.error_scale)
-        self._reward_terms = error_scale, np.array(-0.5), quadratic, parameters.move_weight
+        self._error_scale = np.array(parameters.error_scale)
+        self._minus_half = np.array(-0.5)
 
     __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
@@ -166,31 +163,13 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             load = signals.disturbance.next()
         command, applied, output = self._plants.step(a, noise, load)
         error = setpoint - output
-
-        error_scale, minus_half, quadratic, move_weight = self._reward_terms
-        scaled = error / error_scale
-        if quadratic:
-            rewards = scaled * scaled  # the paper's cost, equation (12)
-            rewards *= minus_half
-        else:
-            rewards = -np.abs(scaled)
-        if move_weight:
-            rewards -= move_weight * np.abs(a - self._actions)
+        rewards = self._rewards(error, a)
+        reading = self._readings(output)
+        observed_error = error
+        if reading is not output:
+            observed_error = setpoint - reading
+        observations = self._window.add(setpoint, observed_error, reading, a)
         self._actions = a
-
-        measured = output
-        measured_error = error
-        if signals.measurement_noise is not None:
-            measured = output + signals.measurement_noise.next()
-            measured_error = setpoint - measured
-        lowest, highest, squared_span = self._span
-        # If the sum of the squared readings is at most the squared span of the transmitter, no
-        # reading is beyond the span.
-        if not measured.dot(measured) <= squared_span:
-            measured = np.fmin(measured, highest)  # fmin turns NaN into the highest reading
-            np.fmax(measured, lowest, out=measured)
-            measured_error = setpoint - measured
-        observations = self._window.add(setpoint, measured_error, measured, a)
         if self._records:
             columns = (values.tolist() for values in (setpoint, output, command, applied))
             for i, sample in enumerate(zip(*columns, strict=True)):
@@ -219,13 +198,43 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             infos[f"_{name}"] = mask
         return observations, rewards, self._all_false.copy(), self._all_false.copy(), infos
 
-    def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
-        """Begin an episode of the plants in the mask; return the infos at k = 0 that are not 0.
+    def _rewards(self, error: Values, a: Values) -> Values:
+        """Return the rewards of errors e(k+1), degC, and actions a(k), all of shape (n,)."""
+        rewards: Values = error / self._error_scale
+        if self.parameters.reward == "quadratic":
+            rewards *= rewards  # the paper's cost, equation (12), scaled and negated
+            rewards *= self._minus_half
+        else:
+            rewards = -np.abs(rewards)
+        move_weight = self.parameters.move_weight
+        if move_weight:
+            rewards -= move_weight * np.abs(a - self._actions)
+        return rewards
 
-        The infos are arrays of shape (num_envs,); elements of plants outside the mask have no
-        meaning.
+    def _readings(self, output: Values) -> Values:
+        """Return the transmitter's readings of the temperatures `output`, degC, shape (n,).
+
+        Readings have noise and saturate at +-`temperature_span`. Without noise and saturation,
+        the result is the array `output` itself.
         """
-        which = np.flatnonzero(mask)
+        reading = output
+        if self._signals.measurement_noise is not None:
+            reading = output + self._signals.measurement_noise.next()
+        # One test for all plants, which is fast: if the sum of the squared readings is at most
+        # the squared span, no reading is beyond the span.
+        span = self.parameters.temperature_span
+        if not reading.dot(reading) <= span * span:
+            reading = np.fmin(reading, span)  # NaN becomes the highest reading
+            np.fmax(reading, -span, out=reading)
+        return reading
+
+    def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
+        """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
+
+        Infos that are always 0 at k = 0 are left out. The infos are arrays of shape
+        (num_envs,), in which elements of other plants have no meaning.
+        """
+        which = np.flatnonzero(mask)  # the indices of the plants
         numbers = self._plant_sampler.sample([self._streams[i] for i in which.tolist()])
         self._plants.reset(which, numbers)
         setpoint = self._signals.reset(which, self._streams, numbers)
@@ -239,18 +248,20 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
                 self._records[i] = Record(numbers_of_plant, interval, setpoint[place].item())
 
         infos: dict[str, NDArray[Any]] = {**self._plants.factors}
-        infos_of_which = {"setpoint": setpoint, "error": setpoint}
-        infos_of_which |= numbers.select(self.parameters.ranges)
-        for name, values in infos_of_which.items():
+        new_values = {"setpoint": setpoint, "error": setpoint}
+        new_values |= numbers.select(self.parameters.ranges)
+        for name, values in new_values.items():
             infos[name] = np.zeros(self.num_envs, values.dtype)
             infos[name][which] = values
         return infos
 
-    def _final(self, ended: Mask, observations: Observations) -> NDArray[np.object_]:
-        """Return the last observation of each plant whose episode has just ended, else None.
+    def _final_observations(
+        self, ended: Mask, observations: Observations
+    ) -> NDArray[np.object_]:
+        """Return the rows of observations of the plants in `ended`, and None for other plants.
 
-        `ended` is True for these plants, and the result is an array of objects; both have the
-        shape (num_envs,). `observations` has the shape (num_envs, size).
+        `observations` has the shape (num_envs, size), and the array of objects that is returned
+        the shape (num_envs,).
         """
         final_observations = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(ended):
@@ -258,7 +269,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return final_observations
 
     def _as_array(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return a copy of a mask or of integers, shape (num_envs,)."""
+        """Return a copy of an array of shape (num_envs,)."""
         return values.copy()
 
     def _hidden_state(self) -> tuple[dict[str, Values], Values]:
@@ -269,10 +280,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return self._plants.numbers.select(self.parameters.ranges), load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Start new random number streams for plants in `mask` that get a seed from `reset`.
+        """Start new random number streams of the plants in `mask` that `seed` gives a seed.
 
-        A ValueError is raised if the seed is neither None, nor an integer, nor a list with an
-        integer or None for each plant. The options need no preparation.
+        At the first reset, plants without a seed get a random seed.
         """
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():
@@ -284,10 +294,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
                 self._streams[i] = RandomStreams.of_seed(int(seed_of_plant))
 
     def _checked_seeds(self, seed: Any) -> Sequence[Any]:
-        """Return the seed of each plant, with None for plants whose random streams continue.
+        """Return a seed for each plant: an integer, or None for no new seed.
 
-        `seed` is None, one integer for plant 0, from which plant i has `seed` + i, or a list
-        with an integer or None for each plant. Another value raises a ValueError.
+        `seed` is None, an integer, from which plant i has the seed `seed` + i, or a list with
+        an integer or None for each plant. Any other value raises a ValueError.
         """
         n = self.num_envs
         if seed is None:
@@ -313,9 +323,9 @@ class _Window:
     """The observations of all plants, in memory such that a new sample takes little copying.
 
     An observation has four blocks: set points, errors, outputs and past actions, each with the
-    newest sample first. The observations lie one after another in a row of memory, from a place
-    that moves back by one element at each step. So the samples of all blocks shift by one
-    without being copied, and only the first element of each block has to be written.
+    newest sample first. The observations of all plants follow each other in one row of memory.
+    At each step, the place in the row at which the first observation begins moves back by one
+    element, which makes room for a new sample at the head of every block without any copying.
 
     Parameters
     ----------
@@ -326,16 +336,16 @@ class _Window:
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
-        heads = np.cumsum([0, *windows[:-1]]).tolist()
-        # Indices of the newest sample of each block in all observations; None for a block of
-        # size 0.
-        self._setpoints, self._errors, self._outputs, self._actions = (
-            np.s_[:, head] if window else None
-            for head, window in zip(heads, windows, strict=True)
-        )
-        self._all_actions = np.s_[:, heads[-1] :]
-        self._shape = num_envs, sum(windows)
-        self._elements = num_envs * sum(windows)
+        # For each block, the index of its newest sample in the observations of all plants; None
+        # for a block of size 0.
+        self._newest: list[tuple[slice, int] | None] = []
+        size = 0
+        for window in windows:
+            self._newest.append(np.s_[:, size] if window else None)
+            size += window
+        self._past_actions = np.s_[:, size - windows[-1] :]
+        self._shape = num_envs, size
+        self._elements = num_envs * size
         self._row = np.zeros(self._elements + STEPS_PER_SHIFT, np.float32)
         self._place = STEPS_PER_SHIFT  # index in the row at which the first observation begins
 
@@ -348,7 +358,7 @@ class _Window:
         return self._row[self._place : self._place + self._elements].reshape(self._shape)
 
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
-        """Begin an episode of some plants at rest.
+        """Set the observations of some plants to those of a plant at rest, at sample k = 0.
 
         Parameters
         ----------
@@ -361,11 +371,13 @@ class _Window:
             plants.
         """
         observations = np.zeros((len(which), self._shape[1]), np.float32)
-        observations[self._all_actions] = np.reshape(np.clip(rest_action, -1.0, 1.0), (-1, 1))
-        if self._setpoints is not None:
-            observations[self._setpoints] = setpoint
-        if self._errors is not None:
-            observations[self._errors] = setpoint
+        observed_action = np.clip(rest_action, -1.0, 1.0)
+        observations[self._past_actions] = np.reshape(observed_action, (-1, 1))
+        setpoints, errors, _, _ = self._newest
+        if setpoints is not None:
+            observations[setpoints] = setpoint
+        if errors is not None:
+            observations[errors] = setpoint  # the temperature is 0
         self._view()[which] = observations
 
     def add(
@@ -373,20 +385,21 @@ class _Window:
     ) -> Observations:
         """Add a sample of all plants, and return a copy of the observations, shape (n, size).
 
-        The four arguments have the shape (n,): set points y_d(k+1), measured errors and
-        measured outputs, degC, and the normalised actions a(k).
+        The sample has set points y_d(k+1), observed errors and outputs, degC, and normalised
+        actions a(k), all of shape (n,).
         """
-        if self._place == 0:
+        if self._place == 0:  # no element of the row is left before the first observation
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]
             self._place = STEPS_PER_SHIFT
         self._place -= 1
         observations = self._view()
-        if self._setpoints is not None:
-            observations[self._setpoints] = setpoint
-        if self._errors is not None:
-            observations[self._errors] = error
-        if self._outputs is not None:
-            observations[self._outputs] = output
-        if self._actions is not None:
-            observations[self._actions] = action.clip(-1.0, 1.0)
+        setpoints, errors, outputs, actions = self._newest
+        if setpoints is not None:
+            observations[setpoints] = setpoint
+        if errors is not None:
+            observations[errors] = error
+        if outputs is not None:
+            observations[outputs] = output
+        if actions is not None:
+            observations[actions] = action.clip(-1.0, 1.0)
         return observations.copy()

@@ -131,6 +131,17 @@ def test_tensors_are_actions_but_those_with_a_graph_are_refused_for_many():
             each.step(torch.ones(2, 1, requires_grad=True))
 
 
+def test_a_tensor_is_a_mask_of_the_plants_to_reset():
+    torch = pytest.importorskip("torch", reason="the mask is a tensor")
+    envs, twin = make_many(), make_many()
+    actions = np.ones((2, 1))
+    for env, mask in ((envs, torch.tensor([True, False])), (twin, np.array([True, False]))):
+        env.reset(seed=0)
+        env.step(actions)
+        env.reset(options={"reset_mask": mask})
+    assert data_equivalence(envs.step(actions), twin.step(actions), exact=True)
+
+
 def test_the_spec_makes_it_again():
     env = make({"action_window": 20}, max_move=0.3, compensate_dead_zone=True)
     again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))

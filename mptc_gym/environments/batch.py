@@ -1,4 +1,4 @@
-"""Implement what the vector environments share: arguments, masks, time limits, resets, infos.
+"""Handle arguments, resets, time limits and infos, in NumPy and PyTorch environments alike.
 
 A mask is an array of bool that selects plants. `MiddlePointVectorEnv` adds plants in NumPy
 arrays, and `MiddlePointTorchEnv` adds plants in PyTorch tensors.
@@ -30,9 +30,7 @@ Mask = NDArray[np.bool_]  # True for the selected plants, shape (num_envs,)
 
 
 class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
-    """n plants that advance together: the part that does not depend on the array library.
-
-    The array library is NumPy or PyTorch.
+    """n plants that advance together: the part that does not depend on NumPy or PyTorch.
 
     Parameters
     ----------
@@ -48,13 +46,12 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
     Attributes
     ----------
     _where : callable
-        `numpy.where` or `torch.where`. A subclass sets this attribute.
+        `numpy.where` or `torch.where`; set by a subclass.
     _window
-        The object that keeps the observations; `_window.present()` returns a copy of the
-        present observations, shape (num_envs, size). A subclass sets this attribute.
+        The object that stores the observations; set by a subclass. `_window.present()` returns
+        a copy of the present observations, shape (num_envs, size).
     _zeros : array
-        Zeros in an array of the library, shape (num_envs,), that nobody modifies. A subclass
-        sets this attribute.
+        Zeros, shape (num_envs,), which nobody modifies; set by a subclass.
     """
 
     _where: Any
@@ -68,13 +65,16 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         autoreset_mode: str | AutoresetMode,
         arguments: Mapping[str, Any],
     ) -> None:
+        """Prepare the plants; the docstring of the class describes the arguments."""
         self.parameters = Parameters.of_environment(arguments)
         self.num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
         limit = -1 if max_episode_steps is None else max_episode_steps
         if not is_count(limit, -1) or limit == 0:
             allowed = "an integer of at least 1, or None or -1 for no limit"
             reject("max_episode_steps", max_episode_steps, allowed)
-        self._limit = UNLIMITED if limit == -1 else min(UNLIMITED, int(limit))  # samples
+        self._episode_length = UNLIMITED  # samples after which an episode is truncated
+        if limit != -1:
+            self._episode_length = min(UNLIMITED, int(limit))
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -85,19 +85,19 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         self.single_observation_space = observation_space(self.parameters)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        # Keys of the infos of every step, and below keys of the masks of these infos.
-        self._names = [*INFO]
+        self._info_names = [*INFO]  # keys of the infos of every step
         if self.parameters.is_disturbed:
-            self._names.append("disturbance")
+            self._info_names.append("disturbance")
         if self.parameters.drifts:
-            self._names += FACTORS
-        self._masks = [f"_{name}" for name in self._names]
+            self._info_names += FACTORS
+        self._was_reset = False
         # Steps of the environment so far. The sample k of a plant is the clock minus the start
         # of the plant's episode.
         self._clock = 0
         self._starts = np.zeros(num_envs, np.int64)  # the clock at k = 0 of each plant
-        self._first_end = 0  # the clock when an episode ends next; 0 before the first reset
-        self._ended: Mask | None = None  # plants whose episode has ended; None for no plant
+        self._next_end = 0  # the clock when an episode ends next
+        # Plants whose episode has ended and that have not been reset; None for no plant.
+        self._ended: Mask | None = None
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -112,6 +112,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         options
             `reset_mask`, a bool array of shape (num_envs,), selects the plants to reset. The
             first reset must include all plants. `MiddlePointTorchEnv` also takes `signals`.
+            Other options are ignored, as in Gymnasium's environments.
 
         Returns
         -------
@@ -120,7 +121,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             the plant's last observation.
         infos : dict
             The infos, in arrays of shape (num_envs,), and the masks of the infos, which are
-            False for plants that are not reset. Several masks may be the same array.
+            False for plants that are not reset. Masks of several infos may be one array.
 
         Raises
         ------
@@ -132,10 +133,11 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         if options is not None and not isinstance(options, Mapping):
             reject("options", options, "a dict or None")
         mask = self._checked_mask(options or {})
-        if not self._first_end and not mask.all():
+        if not self._was_reset and not mask.all():
             raise ResetNeeded("the first reset must include all environments")
         self._prepare(mask, seed, options or {})
-        infos = self._restart(mask, {})
+        infos = self._begin_episodes(mask, {})
+        self._was_reset = True
         return self._window.present(), infos
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
@@ -155,7 +157,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             (num_envs,). No episode terminates; the time limit truncates episodes.
         infos : dict
             The infos at sample k+1, in arrays of shape (num_envs,), and the masks of the infos.
-            Several masks may be the same array.
+            Masks of several infos may be one array.
 
         Raises
         ------
@@ -166,52 +168,54 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             If `step` is called before the first `reset`; with the autoreset mode "Disabled",
             also if an episode has ended and its plant was not reset.
         """
-        if not self._first_end:
+        if not self._was_reset:
             raise ResetNeeded("call reset before step")
-        ended = self._ended
-        if ended is not None and self.autoreset_mode is AutoresetMode.DISABLED:
-            which = np.flatnonzero(ended)
-            raise ResetNeeded(f"reset environments {which}, whose episodes have ended")
+        reset_now = self._ended  # plants to reset in the mode "NextStep"; None for no plant
+        if reset_now is not None and self.autoreset_mode is AutoresetMode.DISABLED:
+            ended_plants = np.flatnonzero(reset_now)
+            raise ResetNeeded(f"reset environments {ended_plants}, whose episodes have ended")
         a = self._checked_actions(actions)
-        if ended is not None and ended.all():
-            infos = self._restart(ended, {})
-            no_rewards = self._zeros + 0  # a copy
-            terminations, truncations = self._as_array(~ended), self._as_array(~ended)
-            return self._window.present(), no_rewards, terminations, truncations, infos
+        if reset_now is not None and reset_now.all():  # no plant moves
+            infos = self._begin_episodes(reset_now, {})
+            rewards = self._zeros + 0.0  # a copy, as the caller may overwrite the rewards
+            terminations = self._as_array(~reset_now)
+            truncations = self._as_array(~reset_now)
+            return self._window.present(), rewards, terminations, truncations, infos
+
         self._clock += 1
-        returned = self._advance(a)
-        if self._clock < self._first_end:
-            return returned
-        return self._end_episodes(*returned)
-
-    def _end_episodes(
-        self, observations: Array, rewards: Array, terminations: Array, _: Array, infos: Infos
-    ) -> tuple[Array, Array, Array, Array, Infos]:
-        """Return what `step` returns when episodes end now, or have ended at the previous step.
-
-        The autoreset mode decides whether this method resets the plants of the ended episodes.
-        The arguments `observations`, `rewards`, `terminations` and `infos`, and the unused
-        truncations, are what `step` would return if no episode ended.
-        """
-        ended = self._clock - self._starts >= self._limit
-        if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            flags = self._as_array(ended)
-            final_info = {name: self._where(flags, infos[name], 0) for name in self._names}
-            infos["final_info"] = final_info | dict.fromkeys(self._masks, flags)
-            infos["_final_info"] = flags
-            infos["final_obs"] = self._final(ended, observations)
-            infos["_final_obs"] = flags
-            self._restart(ended, infos)
-            return self._window.present(), rewards, terminations, self._as_array(ended), infos
-        if self._ended is not None:  # plants that ended at the previous step are reset now
-            rewards = self._where(self._as_array(self._ended), 0, rewards)
-            self._restart(self._ended, infos)
+        observations, rewards, terminations, truncations, infos = self._advance(a)
+        if self._clock < self._next_end:  # the usual case: no episode ends or begins
+            return observations, rewards, terminations, truncations, infos
+        if reset_now is not None:
+            rewards = self._where(self._as_array(reset_now), 0, rewards)
+            self._begin_episodes(reset_now, infos)
             observations = self._window.present()
-            ended = self._clock - self._starts >= self._limit
-        self._ended = ended if ended.any() else None
-        return observations, rewards, terminations, self._as_array(ended), infos
+        ended = self._clock - self._starts >= self._episode_length
+        truncations = self._as_array(ended)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            self._add_final(ended, observations, infos)
+            self._begin_episodes(ended, infos)
+            observations = self._window.present()
+        elif ended.any():
+            self._ended = ended
+        return observations, rewards, terminations, truncations, infos
 
-    def _restart(self, mask: Mask, infos: Infos) -> Infos:
+    def _add_final(self, ended: Mask, observations: Array, infos: Infos) -> None:
+        """Add `final_obs` and `final_info` of the plants in `ended` to the infos of a step.
+
+        `observations`, shape (num_envs, size), and `infos` are the last of the ended episodes.
+        """
+        flags = self._as_array(ended)
+        final_info: Infos = {}
+        for name in self._info_names:
+            final_info[name] = self._where(flags, infos[name], 0)
+            final_info[f"_{name}"] = flags
+        infos["final_info"] = final_info
+        infos["_final_info"] = flags
+        infos["final_obs"] = self._final_observations(ended, observations)
+        infos["_final_obs"] = flags
+
+    def _begin_episodes(self, mask: Mask, infos: Infos) -> Infos:
         """Begin an episode of some plants, and return infos with sample k = 0 of these plants.
 
         Parameters
@@ -219,41 +223,41 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         mask
             The plants.
         infos
-            The infos of a step, which stay valid for the other plants, or an empty dict after a
-            reset. This dict is filled and returned.
+            The infos of a step, or an empty dict. In this dict, which is also returned, the
+            elements of other plants stay the same.
         """
         self._starts[mask] = self._clock
-        self._first_end = int(self._starts.min()) + self._limit
+        self._next_end = int(self._starts.min()) + self._episode_length
         if self._ended is not None:
             still_ended = self._ended & ~mask
             self._ended = still_ended if still_ended.any() else None
         flags = self._as_array(mask)
         first_infos = self._begin(mask)
-        for name in {*self._names, *first_infos}:
+        for name in {*self._info_names, *first_infos}:
             values = first_infos.get(name, self._zeros)
             infos[name] = self._where(flags, values, infos.get(name, 0))
             infos.setdefault(f"_{name}", flags)
         return infos
 
     def plant_state(self) -> PlantState:
-        """Return what a teacher in training may know of each plant at the present sample.
+        """Return the present state of the plants, which no policy can observe.
 
-        A policy cannot observe the state, but a critic or a teacher in training may use the
-        state. The present sample is that of the observation which `step` or `reset` has just
-        returned.
+        In training, a critic or a teacher may use the state. The state belongs to the same
+        sample as the observations that `step` or `reset` has just returned.
 
         Returns
         -------
         PlantState
             Delay (samples), dead zone (t/h), gain (degC per t/h), time constant (s) and load
-            (degC), each of shape (num_envs,). Gain and time constant include drift so far.
+            (degC), each of shape (num_envs,). Gain and time constant include the drift up to
+            the present sample.
 
         Raises
         ------
         ResetNeeded
             If `plant_state` is called before the first `reset`.
         """
-        if not self._first_end:
+        if not self._was_reset:
             raise ResetNeeded("call reset before plant_state")
         ages = self._zeros + self._as_array(self._clock - self._starts)
         numbers, load = self._hidden_state()
@@ -281,39 +285,33 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
 
     @abstractmethod
     def _as_array(self, values: NDArray[Any]) -> Array:
-        """Return a mask or integers, shape (num_envs,), as a new array of the array library."""
+        """Return a NumPy array of shape (num_envs,) as a new array of NumPy or PyTorch."""
 
     @abstractmethod
     def _hidden_state(self) -> tuple[dict[str, Array], Array]:
-        """Return the plant numbers and the load, which no observation shows, for `plant_state`.
+        """Return what no observation shows, for `plant_state`, in arrays of shape (num_envs,).
 
         Returns
         -------
         numbers : dict of array
-            The numbers that were drawn for arguments that are ranges, by name, shape
-            (num_envs,).
+            The numbers that were drawn for arguments that are ranges, by name.
         load : array
-            The load w at the present sample, degC, shape (num_envs,).
+            The load w at the present sample, degC.
         """
 
     @abstractmethod
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Check seed and options of a `reset`, restart random numbers, and store the options.
+        """Check the seed and the options of a `reset` of the plants in `mask`, and apply both.
 
-        Parameters
-        ----------
-        mask
-            The plants to reset, shape (num_envs,).
-        seed, options
-            The arguments of `reset`; a ValueError is raised if one of them is invalid.
+        An invalid seed or option raises a ValueError.
         """
 
     @abstractmethod
     def _begin(self, mask: Mask) -> dict[str, Array]:
-        """Begin an episode of the plants in the mask; return the infos at k = 0 that are not 0.
+        """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
 
-        The arrays have the shape (num_envs,); elements of plants outside the mask have no
-        meaning.
+        Infos that are always 0 at k = 0 are left out. The infos are arrays of shape
+        (num_envs,), in which elements of other plants have no meaning.
         """
 
     @abstractmethod
@@ -332,9 +330,5 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         """
 
     @abstractmethod
-    def _final(self, ended: Mask, observations: Array) -> Array:
-        """Return `final_obs`, the last observations of the plants whose episode has just ended.
-
-        `ended` is True for these plants, shape (num_envs,), and `observations` are the
-        observations of all plants, shape (num_envs, size).
-        """
+    def _final_observations(self, ended: Mask, observations: Array) -> Array:
+        """Return the rows of observations, shape (num_envs, size), of the plants in `ended`."""

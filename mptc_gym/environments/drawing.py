@@ -34,8 +34,8 @@ DEAD_ZONE = (222, 222, 222)
 IN_TRANSIT = (205, 229, 246)
 LIMIT = (130, 130, 130)
 _GRID = (236, 237, 240)
-_INK = (60, 64, 70)
-_PAPER = (255, 255, 255)
+_TEXT = (60, 64, 70)
+_WHITE = (255, 255, 255)
 clock = pygame.time.Clock()  # limits the frame rate of the window
 viewers: WeakSet[object] = WeakSet()  # environments that show pictures in the window
 
@@ -45,13 +45,11 @@ class Label(NamedTuple):
 
     text: str
     colour: Colour
-    ground: Colour = _PAPER  # colour behind the text
+    background: Colour = _WHITE
 
 
 class Panel:
-    """A part of the picture, with a frame, a vertical axis, and a horizontal axis of time.
-
-    The horizontal axis shows the samples of the record, with numbers in minutes.
+    """A diagram in the picture: samples of a record on an axis of time, in minutes.
 
     Parameters
     ----------
@@ -59,8 +57,8 @@ class Panel:
         The picture to draw on.
     record
         The samples to draw.
-    place
-        The panel's rectangle in the picture, pixels.
+    rectangle
+        Where the panel is in the picture, pixels.
     axis
         The lower and the upper end of the vertical axis, degC or t/h.
     """
@@ -69,76 +67,74 @@ class Panel:
         self,
         surface: pygame.Surface,
         record: Record,
-        place: pygame.Rect,
+        rectangle: pygame.Rect,
         axis: tuple[float, float],
     ) -> None:
         self._surface = surface
         self._record = record
-        self._place = place
+        self._rectangle = rectangle
         self._axis = axis
         self._font = pygame.font.Font(None, 22)
 
     def x(self, k: float) -> float:
         """Return the horizontal position of sample k, pixels from the picture's left edge."""
         samples = k - self._record.first
-        return self._place.left + samples * self._place.width / self._record.span
+        return self._rectangle.left + samples * self._rectangle.width / self._record.span
 
     def y(self, value: float) -> float:
         """Return the vertical position of a value, pixels from the picture's upper edge.
 
-        `value` has the unit of the vertical axis, degC or t/h. A value beyond the vertical axis
-        gets a position at the edge of the panel.
+        `value` has the unit of the vertical axis, degC or t/h. The position of a value beyond
+        the axis is at the edge of the panel.
         """
         low, high = self._axis
-        below_top = (high - value) / (high - low) * self._place.height
+        below_top = (high - value) / (high - low) * self._rectangle.height
         # At least 3 pixels, a line's width, inside the frame. By the order of min and max, NaN
         # is drawn at the lower edge.
-        return self._place.top + max(3.0, min(self._place.height - 3.0, below_top))
+        return self._rectangle.top + max(3.0, min(self._rectangle.height - 3.0, below_top))
 
     def grid(self) -> None:
         """Draw the grid and the frame of the panel, and write the numbers of both axes."""
-        place = self._place
+        rectangle = self._rectangle
         for value in ticks(*self._axis):
-            self.level(_GRID, value)
-            self.write(f"{value:.6g}", _INK, midright=(place.left - 8, self.y(value)))
+            self.horizontal_line(_GRID, value)
+            self.write(f"{value:.6g}", _TEXT, midright=(rectangle.left - 8, self.y(value)))
         first = self._record.first
-        samples_per_minute = 60.0 / self._record.sampling_interval
         last = first + self._record.span
+        samples_per_minute = 60.0 / self._record.sampling_interval
         for minutes in ticks(first / samples_per_minute, last / samples_per_minute):
             x = self.x(minutes * samples_per_minute)
-            pygame.draw.line(self._surface, _GRID, (x, place.top), (x, place.bottom))
-            self.write(f"{minutes:.6g}", _INK, midtop=(x, place.bottom + 6))
-        # The unit of the time axis stands to the left of the axis, clear of a number at the
-        # edge.
-        self.write("min", _INK, topright=(place.left - 34, place.bottom + 6))
-        frame_of_panel = place.left, place.top, place.width + 1, place.height + 1
-        pygame.draw.rect(self._surface, LIMIT, frame_of_panel, 1)
+            pygame.draw.line(self._surface, _GRID, (x, rectangle.top), (x, rectangle.bottom))
+            self.write(f"{minutes:.6g}", _TEXT, midtop=(x, rectangle.bottom + 6))
+        # The unit of the time axis stands so far left that no number of the axis meets it.
+        self.write("min", _TEXT, topright=(rectangle.left - 34, rectangle.bottom + 6))
+        size_of_frame = rectangle.width + 1, rectangle.height + 1
+        frame_of_panel = pygame.Rect(rectangle.topleft, size_of_frame)
+        pygame.draw.rect(self._surface, LIMIT, frame_of_panel, width=1)
 
     def shade(self, colour: Colour, first: int, last: int, low: float, high: float) -> None:
-        """Shade a rectangle of the panel.
+        """Shade the area from sample `first` to sample `last`, and from value `low` to `high`.
 
-        Parameters
-        ----------
-        colour
-            Colour by which the colours of the picture are multiplied.
-        first, last
-            The samples at the left and the right edge of the rectangle.
-        low, high
-            The values at the lower and the upper edge, in the unit of the vertical axis.
+        The values have the unit of the vertical axis. The colours of the picture are multiplied
+        by `colour`, so that lines under the area stay visible.
         """
-        left = max(self._place.left, round(self.x(first)))
+        left = max(self._rectangle.left, round(self.x(first)))
         right = round(self.x(last))
         top = round(self.y(high))
         bottom = round(self.y(low))
         area = left, top, right - left, bottom - top + 1
         self._surface.fill(colour, area, pygame.BLEND_RGB_MULT)
 
-    def level(self, colour: Colour, value: float) -> None:
-        """Draw a horizontal line of a colour at `value`, in the panel's unit, degC or t/h."""
+    def horizontal_line(self, colour: Colour, value: float) -> None:
+        """Draw a line over the width of the panel at `value`, degC or t/h as the axis."""
+        left = self._rectangle.left
+        right = self._rectangle.right
         y = self.y(value)
-        pygame.draw.line(self._surface, colour, (self._place.left, y), (self._place.right, y))
+        pygame.draw.line(self._surface, colour, (left, y), (right, y))
 
-    def curve(self, colour: Colour, values: Sequence[float], width: int, *, held: bool) -> None:
+    def curve(
+        self, colour: Colour, values: Sequence[float], width: int, *, is_staircase: bool
+    ) -> None:
         """Draw a curve through the values of the latest samples.
 
         Parameters
@@ -150,16 +146,16 @@ class Panel:
             vertical axis.
         width
             Width of the line, pixels.
-        held
-            Whether the curve is a staircase, in which each value holds until the next sample;
-            otherwise, straight lines join the values.
+        is_staircase
+            Whether each value holds until the next sample; otherwise, straight lines join the
+            values.
         """
         first = self._record.k + 1 - len(values)
         points: list[tuple[float, float]] = []
         for k, value in enumerate(values, start=first):
             x = self.x(k)
             y = self.y(value)
-            if held and points:
+            if is_staircase and points:
                 _, previous_y = points[-1]
                 points.append((x, previous_y))
             points.append((x, y))
@@ -168,13 +164,17 @@ class Panel:
 
     def heading(self, *labels: Label) -> None:
         """Write labels in one line above the panel, from left to right."""
-        x, y = self._place.left, self._place.top - 16
+        x, y = self._rectangle.left, self._rectangle.top - 16
         for label in labels:
-            box = self.write(f" {label.text} ", label.colour, label.ground, midleft=(x, y))
+            box = self.write(f" {label.text} ", label.colour, label.background, midleft=(x, y))
             x = box.right + 12
 
     def write(
-        self, text: str, colour: Colour, ground: Colour = _PAPER, **anchor: tuple[float, float]
+        self,
+        text: str,
+        colour: Colour,
+        background: Colour = _WHITE,
+        **anchor: tuple[float, float],
     ) -> pygame.Rect:
         """Write a text into the picture, and return the rectangle that the text fills, pixels.
 
@@ -182,23 +182,25 @@ class Panel:
         ----------
         text
             The text, whose hyphens are written as minus signs.
-        colour, ground
+        colour, background
             Colour of the text, and colour behind the text.
         **anchor
             The position of one point of the rectangle, by pygame's name of the point, as in
             `midleft=(x, y)`, pixels from the picture's upper left corner.
         """
-        image = self._font.render(text.replace("-", "\N{MINUS SIGN}"), True, colour, ground)
+        minus_sign = "\N{MINUS SIGN}"
+        image = self._font.render(text.replace("-", minus_sign), True, colour, background)
         ((name, (x, y)),) = anchor.items()
-        return self._surface.blit(image, image.get_rect(**{name: (round(x), round(y))}))
+        rectangle = image.get_rect(**{name: (round(x), round(y))})
+        return self._surface.blit(image, rectangle)
 
 
 def draw(record: Record) -> pygame.Surface:
     """Return a picture of a record, 960 pixels wide and 540 pixels high."""
     pygame.font.init()
-    # Three bytes per pixel, in the order of an array, so that making an array is just a copy.
+    # The bytes of a pixel are in the order red, green, blue, as in the arrays of `frame`.
     surface = pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
-    surface.fill(_PAPER)
+    surface.fill(_WHITE)
     _draw_temperatures(surface, record)
     _draw_flows(surface, record)
     return surface
@@ -208,25 +210,26 @@ def _draw_temperatures(surface: pygame.Surface, record: Record) -> None:
     """Draw the upper panel of a record on a surface: temperature and set point, degC."""
     panel = Panel(surface, record, TEMPERATURES, record.temperature_axis)
     panel.grid()
-    panel.curve(TEMPERATURE, [sample.output for sample in record.samples], 3, held=False)
-    # The set point lies above the temperature, and is thinner, so that both curves can be seen
-    # where both agree.
-    panel.curve(SETPOINT, [sample.setpoint for sample in record.samples], 2, held=True)
+    panel.curve(
+        TEMPERATURE, [sample.output for sample in record.samples], 3, is_staircase=False
+    )
+    # The set point is drawn later and thinner than the temperature, so that both curves can be
+    # seen where they agree.
+    panel.curve(SETPOINT, [sample.setpoint for sample in record.samples], 2, is_staircase=True)
     newest = record.samples[-1]
     minutes = record.k * record.sampling_interval / 60.0
     panel.heading(
         Label(f"temperature {_two_decimals(newest.output)} °C", TEMPERATURE),
         Label(f"set point {_two_decimals(newest.setpoint)} °C", SETPOINT),
-        Label(f"error {_two_decimals(newest.setpoint - newest.output)} °C", _INK),
-        Label(f"time {minutes:.2f} min", _INK),
+        Label(f"error {_two_decimals(newest.setpoint - newest.output)} °C", _TEXT),
+        Label(f"time {minutes:.2f} min", _TEXT),
     )
 
 
 def _draw_flows(surface: pygame.Surface, record: Record) -> None:
-    """Draw the lower panel of a record on a surface: flows, limits, dead zone, transit time.
+    """Draw the lower panel of a record on a surface: flows, t/h, limits and dead zone.
 
-    The transit time is shaded: a flow that was applied in this time has not yet reached the
-    middle point.
+    The time in which an applied flow has not yet reached the middle point is shaded.
     """
     plant = record.plant
     panel = Panel(surface, record, FLOWS, record.flow_axis)
@@ -237,18 +240,18 @@ def _draw_flows(surface: pygame.Surface, record: Record) -> None:
     lowest, highest = record.flow_axis
     panel.shade(IN_TRANSIT, record.k - int(plant.delay), record.k, lowest, highest)
     for limit in (plant.u_min, plant.u_max):
-        panel.level(LIMIT, limit)
-    # A sample k holds the flows of the step from sample k-1 to k, so these flows begin at
-    # sample k-1 in the picture. The flows of the oldest sample would begin before the picture.
+        panel.horizontal_line(LIMIT, limit)
+    # A sample k holds the flows from sample k-1 to k, so each flow is drawn from sample k-1 on,
+    # and the newest flow holds up to sample k. The oldest flow would begin before the picture.
     applied = [sample.applied for sample in record.samples]
     commands = [sample.command for sample in record.samples]
-    panel.curve(APPLIED, [*applied[1:], applied[-1]], 3, held=True)
-    panel.curve(COMMAND, [*commands[1:], commands[-1]], 1, held=True)
+    panel.curve(APPLIED, [*applied[1:], applied[-1]], 3, is_staircase=True)
+    panel.curve(COMMAND, [*commands[1:], commands[-1]], 1, is_staircase=True)
     panel.heading(
         Label(f"applied flow {_two_decimals(applied[-1])} t/h", APPLIED),
         Label(f"command {_two_decimals(commands[-1])} t/h", COMMAND),
-        Label("dead zone", _INK, DEAD_ZONE),
-        Label("in transit", _INK, IN_TRANSIT),
+        Label("dead zone", _TEXT, DEAD_ZONE),
+        Label("in transit", _TEXT, IN_TRANSIT),
     )
 
 
@@ -258,9 +261,9 @@ def frame(record: Record) -> NDArray[np.uint8]:
 
 
 def show(record: Record, fps: float, viewer: object) -> None:
-    """Show a picture of a record in a window, which is opened if necessary.
+    """Show a picture of a record in the window, which is opened if necessary.
 
-    All environments share one window, which stays open until each of them has called `hide`.
+    All environments share the window, which stays open until each of them has called `hide`.
 
     Parameters
     ----------
@@ -291,20 +294,19 @@ def hide(viewer: object) -> None:
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return the numbers to write on an axis from `low` to `high`: 3 to 7 round numbers.
+    """Return the 3 to 7 numbers to write on an axis from `low` to `high`.
 
-    The numbers are multiples of 1, 2 or 5 times a power of ten.
+    The numbers are the multiples of 1, 2 or 5 times a power of ten.
     """
     smallest_step = (high - low) / 6.0
     power = 10.0 ** math.floor(math.log10(smallest_step))
-    step = next(
-        power * digit for digit in (1.0, 2.0, 5.0, 10.0) if power * digit >= smallest_step
-    )
+    steps = (power, power * 2.0, power * 5.0, power * 10.0)
+    step = next(step for step in steps if step >= smallest_step)
     return [i * step for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def _two_decimals(value: float) -> str:
     """Return a number as text with two decimals, never "-0.00"; from 1e5 on, three digits."""
     if abs(value) < 1e5:
-        return f"{round(value, 2) + 0.0:.2f}"
+        return f"{round(value, 2) + 0.0:.2f}"  # adding 0.0 turns -0.0 into 0.0
     return f"{value:.3g}"

@@ -1,7 +1,7 @@
-"""Look into environments of any kind: their layers, their plants and their wrappers.
+"""Find the layers of an environment of any kind, its plants and its wrappers.
 
-A layer is one environment object in a nesting: a wrapper, a vector environment or an innermost
-environment.
+A layer is one of the objects that form an environment: a wrapper, a vector environment or an
+innermost environment.
 """
 
 from __future__ import annotations
@@ -47,18 +47,15 @@ class PlantGroup(NamedTuple):
 def loaded(name: str) -> Any:
     """Return the class with the full name `name`, or () if its module has not been imported.
 
-    The result is the second argument of an `isinstance`, which is False for (). So an optional
-    package need not be imported to recognise objects of the package.
+    As `isinstance(object, ())` is False, objects of an optional package can be recognised
+    without importing the package.
     """
     module, _, class_name = name.rpartition(".")
     return getattr(sys.modules.get(module), class_name, ())
 
 
 def is_environment(env: Any) -> bool:
-    """Whether `env` is an environment or a vector environment.
-
-    Objects of Gymnasium, and a `VecEnv` of Stable-Baselines3, count.
-    """
+    """Whether `env` is an `Env` or `VectorEnv` of Gymnasium, or a `VecEnv` of SB3."""
     return isinstance(env, (gymnasium.Env, VectorEnv, loaded(f"{VEC_ENV}.VecEnv")))
 
 
@@ -68,18 +65,19 @@ def runs_processes(layer: Any) -> bool:
 
 
 def normaliser_flag(layer: Any) -> str:
-    """Return the attribute that switches updates of a layer's statistics on and off.
+    """Return the name of the attribute that switches a normaliser's updates on and off.
 
-    The result is "" if the layer does not normalise observations or rewards by statistics.
+    The result is "" if `layer` does not normalise observations or rewards by statistics.
     """
     if isinstance(layer, loaded(f"{VEC_ENV}.VecNormalize")):
         return "training"
-    # The wrappers of Gymnasium that normalise, of one environment or of many.
-    return "update_running_mean" if hasattr(type(layer), "update_running_mean") else ""
+    if hasattr(type(layer), "update_running_mean"):  # a wrapper of Gymnasium
+        return "update_running_mean"
+    return ""
 
 
 def inner_environments(env: Any) -> list[Any]:
-    """Return the environments directly within `env`; none that run in other processes."""
+    """Return the environments directly within `env`, except those in other processes."""
     inner: list[Any] = []
     for name in INNER:
         value = vars(env).get(name)
@@ -89,19 +87,14 @@ def inner_environments(env: Any) -> list[Any]:
 
 
 def layers(env: Any) -> Iterator[Any]:
-    """Yield the environment `env` and all environments within it, the outermost first.
-
-    Environments in other processes are not included.
-    """
+    """Yield `env` and all environments within `env` in this process, the outermost first."""
     yield env
     for inner in inner_environments(env):
         yield from layers(inner)
 
 
 def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
-    """Return a description of the plants in an environment, in the order of the plants.
-
-    Plants in other processes are included.
+    """Return descriptions of the plants in an environment, also of those in other processes.
 
     Parameters
     ----------
@@ -113,15 +106,19 @@ def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
     Returns
     -------
     list of PlantGroup
-        One element for each environment or batch of plants. The list is empty if `env` holds no
-        plants of this package in NumPy, or if the processes of `env` are closed.
+        One element for each environment or batch of plants, in the order of the plants. The
+        list is empty if `env` holds no plants of this package in NumPy, or if the processes of
+        `env` are closed.
     """
     wrappers = outer
     if _changes_policy(env):
-        increments = vars(env).get("increments", "")  # the arguments of an IncrementalAction
-        limit = vars(env).get("clip_obs")  # of a VecNormalize
-        name = f"{type(env).__name__}{increments}"
-        wrappers = (*outer, name if limit is None else f"{name}(clip_obs={limit:g})")
+        wrapper = type(env).__name__
+        if "increments" in vars(env):  # an IncrementalAction
+            wrapper += f"{env.increments}"
+        clip_obs = vars(env).get("clip_obs")
+        if clip_obs is not None:  # a VecNormalize
+            wrapper += f"(clip_obs={clip_obs:g})"
+        wrappers = (*outer, wrapper)
     if isinstance(env, MiddlePointEnv | MiddlePointVectorEnv):
         name = env.spec.id if env.spec else type(env).__name__
         return [PlantGroup(env.parameters, getattr(env, "num_envs", 1), name, wrappers)]
@@ -135,8 +132,8 @@ def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
 
 def _changes_policy(layer: Any) -> bool:
     """Whether a layer is a wrapper that may change observations or actions of a policy."""
-    of_rewards = gymnasium.RewardWrapper, gymnasium.vector.VectorRewardWrapper
-    if type(layer).__name__ in _NEUTRAL or isinstance(layer, of_rewards):
+    reward_wrappers = gymnasium.RewardWrapper, gymnasium.vector.VectorRewardWrapper
+    if type(layer).__name__ in _NEUTRAL or isinstance(layer, reward_wrappers):
         return False
     if not vars(layer).get("norm_obs", True):  # a VecNormalize of rewards alone
         return False
@@ -145,10 +142,10 @@ def _changes_policy(layer: Any) -> bool:
 
 
 def ask_processes(env: Any, method: str, *arguments: Any) -> list[Any]:
-    """Return what a method returns for each environment in other processes.
+    """Call a method of each environment in other processes, and return the results.
 
-    If an environment lacks the method, or if a result cannot be pickled, the process of this
-    environment ends.
+    An environment without the method, or with a result that cannot be pickled, ends its
+    process.
 
     Parameters
     ----------
@@ -159,14 +156,15 @@ def ask_processes(env: Any, method: str, *arguments: Any) -> list[Any]:
     *arguments
         Arguments of the method.
     """
-    ask = getattr(env, "env_method", None) or env.call
-    return list(ask(method, *arguments))
+    call_each = getattr(env, "env_method", None) or env.call
+    return list(call_each(method, *arguments))
 
 
 def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
-    """Return the plants in other processes, as `plant_groups` does; [] if these are closed.
+    """Return the plants in the processes of `env`, as `plant_groups` does.
 
-    `env` runs the processes, and `outer` holds the names of the wrappers around `env`.
+    `outer` holds the names of the wrappers around `env`. The result is [] if the processes are
+    closed.
     """
     try:
         texts = ask_processes(env, "__str__")
@@ -176,12 +174,12 @@ def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
     except Exception:  # whatever closed or broken processes raise
         return []
     groups = []
-    for text, plant_parameters in zip(texts, parameters, strict=True):
+    for text, parameters_of_plant in zip(texts, parameters, strict=True):
         # An example of a text is "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>". For an
         # environment without an id, it is "<TimeLimit<MiddlePointEnv instance>>".
-        *classes, last = text.strip("<>").split("<")
+        *classes, innermost = text.strip("<>").split("<")
         wrappers = tuple(name for name in classes if name not in _NEUTRAL)
-        if isinstance(plant_parameters, Parameters):
-            name = last.removesuffix(" instance")
-            groups.append(PlantGroup(plant_parameters, 1, name, outer + wrappers))
+        if isinstance(parameters_of_plant, Parameters):
+            name_of_plant = innermost.removesuffix(" instance")
+            groups.append(PlantGroup(parameters_of_plant, 1, name_of_plant, outer + wrappers))
     return groups

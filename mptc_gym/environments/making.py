@@ -18,7 +18,7 @@ Env = gymnasium.Env[Any, Any]
 
 
 def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
-    """Return the environment that an id or an `EnvSpec` stands for.
+    """Make one environment by `gymnasium.make`, without Gymnasium's environment checker.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
 
 
 def make_batch(single: Env, n: int, **modes: Any) -> Any:
-    """Return n environments like `single` in one vector environment.
+    """Return n environments like `single` in one batch, or None if no batch can hold them.
 
     Parameters
     ----------
@@ -56,18 +56,21 @@ def make_batch(single: Env, n: int, **modes: Any) -> Any:
     Returns
     -------
     VectorEnv or None
-        None if `single` is not a `MiddlePointEnv`, or is in a wrapper other than
-        `IncrementalAction` and the wrappers of `gymnasium.make`.
+        A `MiddlePointVectorEnv`, wrapped as `single`. None if `single` is not a
+        `MiddlePointEnv`, or has a wrapper other than `IncrementalAction` and the wrappers of
+        `gymnasium.make`.
     """
-    spec, plant = single.spec, single.unwrapped
+    spec = single.spec
+    plant = single.unwrapped
     if spec is None or type(plant) is not MiddlePointEnv:
         return None
     wrappers = {wrapper.entry_point for wrapper in spec.additional_wrappers}
     if wrappers - {"mptc_gym.wrappers:IncrementalAction"}:
         return None
-    modes["max_episode_steps"] = spec.max_episode_steps
-    plants: Any = MiddlePointVectorEnv(n, **modes, **asdict(plant.parameters))
-    plants.spec = spec
+    envs: Any = MiddlePointVectorEnv(
+        n, max_episode_steps=spec.max_episode_steps, **modes, **asdict(plant.parameters)
+    )
+    envs.spec = spec
     for wrapper in spec.additional_wrappers:
-        plants = IncrementalAction(plants, **(wrapper.kwargs or {}))
-    return plants
+        envs = IncrementalAction(envs, **(wrapper.kwargs or {}))
+    return envs

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from mptc_gym.plant.parameters import PlantNumbers
 
-SPAN = 200  # fewest samples that a picture spans: some 27 minutes of 8 s samples
-LONGEST = 2000  # most samples that a picture spans, even where four delays are longer
+FEWEST_SAMPLES = 200  # of a picture's width: some 27 minutes of 8 s samples
+MOST_SAMPLES = 2000  # of a picture's width, even where four delays are longer
 FARTHEST = 1e12  # degC; temperatures beyond +-FARTHEST, and NaN, are drawn at the edge
 
 
@@ -24,15 +24,6 @@ class Sample(NamedTuple):
 
 class Record:
     """The latest samples of an episode, and the axes of a picture of these samples.
-
-    Parameters
-    ----------
-    plant
-        The plant numbers of the episode.
-    sampling_interval
-        Sampling interval, s.
-    setpoint
-        Set point at k = 0, degC. Temperature and flows are 0 at k = 0.
 
     Attributes
     ----------
@@ -56,9 +47,13 @@ class Record:
     def __init__(
         self, plant: PlantNumbers[float], sampling_interval: float, setpoint: float
     ) -> None:
+        """Begin the record at k = 0, with the set point `setpoint`, degC.
+
+        Temperature and flows are 0 at k = 0.
+        """
         self.plant = plant
         self.sampling_interval = sampling_interval
-        self.span = min(max(SPAN, 4 * int(plant.delay)), LONGEST)
+        self.span = min(max(FEWEST_SAMPLES, 4 * int(plant.delay)), MOST_SAMPLES)
         lowest_flow = min(plant.u_min, 0.0)
         highest_flow = max(plant.u_max, 0.0)
         margin = 0.12 * (highest_flow - lowest_flow)
@@ -91,6 +86,6 @@ class Record:
 
     @property
     def temperature_axis(self) -> tuple[float, float]:
-        """The ends of the temperature axis, degC: the episode's extremes with a margin."""
+        """The ends of the temperature axis, degC: extremes of the episode, with a margin."""
         margin = max(0.05 * (self._highest - self._lowest), 0.5)
         return self._lowest - margin, self._highest + margin

@@ -7,7 +7,7 @@ import math
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import DependencyNotInstalled
@@ -28,21 +28,33 @@ from mptc_gym.environments.making import make_one
 from mptc_gym.plant.checks import is_count, one_of, reject
 from mptc_gym.plant.dynamics import FACTORS, action_from_command
 from mptc_gym.plant.parameters import ARGUMENTS, full_signature
-from mptc_gym.plant.signals import UNLIMITED, SetPointLevels
+from mptc_gym.plant.signals import SetPointLevels
 from mptc_gym.torch_env.episodes import (
-    LONGEST,
-    SIGNALS,
+    MOST_BLOCK_SAMPLES,
+    SIGNAL_NAMES,
     Episodes,
-    External,
-    History,
+    ExternalValues,
+    Restart,
     as_tensor,
-    read_signals,
+    copy_to_device,
+    read_external,
 )
 from mptc_gym.torch_env.plant import TorchPlants
 from mptc_gym.torch_env.signals import make_signals
+from mptc_gym.torch_env.window import Window
 
 # Most numbers in a block of a signal on a CPU: 512 KiB of float32, which fit in the cache.
-_IN_CACHE = 1 << 17
+_NUMBERS_IN_CACHE = 1 << 17
+
+
+class _Step(NamedTuple):
+    """What `step` will return for a sample, as far as known before the action of the step."""
+
+    rewards: Tensor  # without the cost of moves, shape (n,)
+    terminations: Tensor  # shape (n,)
+    truncations: Tensor  # shape (n,)
+    infos: Infos  # without commanded and applied flows
+    load: Tensor  # load w, degC, shape (n,), for `plant_state`
 
 
 class MiddlePointTorchEnv(BatchEnv):
@@ -60,16 +72,16 @@ class MiddlePointTorchEnv(BatchEnv):
     Parameters
     ----------
     num_envs, max_episode_steps, autoreset_mode
-        The same as for `MiddlePointVectorEnv`, but `final_obs` is a tensor, which is 0 for
-        plants whose episode has not ended.
+        See `MiddlePointVectorEnv`. In `MiddlePointTorchEnv`, `final_obs` is a tensor, with
+        zeros for plants whose episode has not ended.
     device
         Device of all computations and tensors.
     dtype
         torch.float32 or torch.float64: the type of all computations and of the observations.
-        The type of the spaces is always float32.
+        The spaces are always float32.
     differentiable
         Whether observations, rewards and infos carry PyTorch's gradient graph back to the
-        actions of the present and of earlier steps; see Gradients.
+        actions of the present and of earlier steps; see the note on gradients.
     **arguments
         The arguments of `MiddlePointEnv` except `render_mode`. All plants have the same
         arguments, but where an argument is a range, every plant draws its own number.
@@ -79,7 +91,7 @@ class MiddlePointTorchEnv(BatchEnv):
     autoreset_mode : AutoresetMode
         When the plant of an ended episode is reset: see `MiddlePointVectorEnv`.
     checks_actions : bool
-        Whether `step` refuses actions that are not finite; see Waiting.
+        Whether `step` refuses actions that are not finite; see the note on waiting.
 
     Raises
     ------
@@ -93,9 +105,9 @@ class MiddlePointTorchEnv(BatchEnv):
     **Random numbers.** All random numbers come from one `torch.Generator` on the device, which
     `reset(seed=seed)` restarts. The same seed, arguments and resets give the same numbers on
     the same device, with the same versions of this package and of PyTorch. The random numbers
-    have the distributions of `MiddlePointVectorEnv`, but other values. The j-th episode of a
-    plant depends on the length of earlier episodes and on the other plants. So compare
-    controllers in `MiddlePointVectorEnv`, or on external signals.
+    have the distributions of `MiddlePointVectorEnv`, but other values. Unlike there, the j-th
+    episode of a plant depends on the length of earlier episodes and on the other plants. So
+    compare controllers in `MiddlePointVectorEnv`, or on external signals.
 
     **External signals.** `reset(options={"signals": signals})` takes a dict of tensors. "noise"
     (the noise n), "setpoint" (the set point y_d), "disturbance" (the load w) and
@@ -103,8 +115,8 @@ class MiddlePointTorchEnv(BatchEnv):
     dict may also hold a number per plant, shape (num_envs,), for each argument that is a range,
     under the argument's name. If a tensor has a further, leading dimension, the j-th episode of
     a plant gets the j-th element; after the last element, the first element follows again.
-    Signals and arguments that are not in the dict are random. A step beyond the last sample of
-    a signal raises a ValueError.
+    Signals and ranges that are not in the dict are generated as usual. A step beyond the last
+    sample of a signal raises a ValueError.
 
     **Gradients.** The gradient of rewards and observations with respect to actions goes
     straight through the dead zone, as if there were no dead zone: so a policy also learns from
@@ -139,6 +151,7 @@ class MiddlePointTorchEnv(BatchEnv):
         differentiable: bool = False,
         **arguments: Any,
     ) -> None:
+        """Prepare the plants; the docstring of the class describes the arguments."""
         one_of("render_mode", arguments.pop("render_mode", None), [None])
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
@@ -148,7 +161,7 @@ class MiddlePointTorchEnv(BatchEnv):
         try:
             self.device = torch.device(device)
             self._zeros = torch.zeros(num_envs, dtype=dtype, device=self.device)
-            torch.Generator(self.device)
+            torch.Generator(self.device)  # fails on "meta", which has tensors without values
         except (AssertionError, RuntimeError, TypeError, ValueError) as error:
             reject("device", device, f"a device that PyTorch can use ({error})")
         self.dtype = dtype
@@ -158,23 +171,24 @@ class MiddlePointTorchEnv(BatchEnv):
 
         self._episodes = Episodes(self.parameters, self._zeros)
         self._plants = TorchPlants(self.parameters, self._episodes)
-        self._drawn_signals = make_signals(self.parameters, self._episodes)
-        self._signals = self._drawn_signals  # random or external signals, by name
-        self._external: dict[str, External] = {}  # external signals and plant numbers
-        self._last_sample = UNLIMITED  # the last k for which all external signals have a value
+        self._window = Window(self.parameters.windows, self._zeros)
+        self._load = self._zeros  # the load w at the present sample, degC, shape (n,)
+        self._own_signals = make_signals(self.parameters, self._episodes)
+        self._signals = self._own_signals  # own or external signals, by name
+        self._external: dict[str, ExternalValues] = {}  # external signals and plant numbers
+        # The last k for which all external signals have a value; None without such signals.
+        self._last_sample: int | None = None
         # On a CPU, a block of samples must fit in the processor's cache. On other devices,
         # blocks are as long as possible, since every call of PyTorch takes long.
-        in_cache = LONGEST
+        self._most_samples = min(MOST_BLOCK_SAMPLES, self._plants.most_samples)
         if self.device.type == "cpu":
-            in_cache = max(1, _IN_CACHE // num_envs)
+            in_cache = max(1, _NUMBERS_IN_CACHE // num_envs)
+            self._most_samples = min(self._most_samples, in_cache)
         levels = SetPointLevels(self.parameters)
-        shortest_level = levels.shortest if levels.random else LONGEST
-        self._block = min(self._plants.most_samples, LONGEST, in_cache, shortest_level)
-        # What the coming steps of the present block return, the next step last: rewards,
-        # terminations, truncations and infos.
-        self._ahead: list[tuple[Tensor, Tensor, Tensor, Infos]] = []
-        self._window = _Window(self.parameters.windows, self._zeros)
-        self._loads = History(self._zeros, 1)  # load w, degC
+        if levels.random:
+            self._most_samples = min(self._most_samples, levels.shortest)
+        # The coming steps of the present block, the next step last.
+        self._ahead: list[_Step] = []
 
     __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
@@ -192,16 +206,15 @@ class MiddlePointTorchEnv(BatchEnv):
         """Cut the gradient graph to earlier actions, for truncated backpropagation.
 
         The tensors that later steps return then depend only on actions after the call of
-        `detach`. The tensors that earlier steps have returned stay attached to the graph. So
-        also detach the latest observation before the policy sees this observation: otherwise
-        the next action depends on earlier actions through the observation.
+        `detach`. The tensors that earlier steps have returned stay attached to the graph:
+        detach the latest observation, too, before the policy sees it.
         """
         self._plants.detach()
         self._window.detach()
         self._action = self._action.detach()
-        for k, (rewards, terminations, truncations, infos) in enumerate(self._ahead):
-            detached = {name: values.detach() for name, values in infos.items()}
-            self._ahead[k] = rewards.detach(), terminations, truncations, detached
+        for k, step in enumerate(self._ahead):
+            infos = {name: values.detach() for name, values in step.infos.items()}
+            self._ahead[k] = step._replace(rewards=step.rewards.detach(), infos=infos)
 
     def _advance(self, a: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
         """Move all plants by one sample, and return what `step` returns if no episode ends.
@@ -211,7 +224,7 @@ class MiddlePointTorchEnv(BatchEnv):
         command, applied = self._plants.apply(a)
         if not self._ahead:
             self._compute_block()
-        rewards, terminations, truncations, infos = self._ahead.pop()
+        rewards, terminations, truncations, infos, self._load = self._ahead.pop()
         observations = self._window.next(a)
         if self.parameters.move_weight:
             rewards = rewards - self.parameters.move_weight * (a - self._action).abs()
@@ -221,13 +234,13 @@ class MiddlePointTorchEnv(BatchEnv):
         return observations, rewards, terminations, truncations, infos
 
     def _compute_block(self) -> None:
-        """Compute what the steps of a block return, except what depends on later actions.
+        """Compute ahead what the steps of a block return, in `self._ahead` and `self._window`.
 
         An action affects the temperature only after the delay, so the temperatures of a block
-        follow from the actions so far. Commanded flows, applied flows and the cost of moves are
-        left to each step.
+        follow from the actions so far.
         """
-        samples = max(1, min(self._block, self._first_end - self._clock + 1))
+        samples_to_next_end = self._next_end - self._clock + 1
+        samples = max(1, min(self._most_samples, samples_to_next_end))
         block = self._episodes.block(self._clock, samples)
         signals = {name: signal.next(block) for name, signal in self._signals.items()}
         setpoint = signals["setpoint"]
@@ -235,34 +248,42 @@ class MiddlePointTorchEnv(BatchEnv):
         load = signals.get("disturbance")
         output, factors = self._plants.outputs(block, noise, load)
         error = setpoint - output
-        measured = output
+        reading = output
         if "measurement_noise" in signals:
-            measured = output + signals["measurement_noise"]
+            reading = output + signals["measurement_noise"]
         span = self.parameters.temperature_span
-        measured = measured.clamp(-span, span)
-        self._window.extend(setpoint, setpoint - measured, measured)
+        reading = reading.clamp(-span, span)
+        self._window.extend(setpoint, setpoint - reading, reading)
 
+        # The infos of the block: for each name, a row of shape (n,) for each sample. What the
+        # environment still needs is copied, as the caller may overwrite the infos.
         if noise is None:
             noise = torch.zeros_like(error)
-        rewards = self._rewards(error).unbind()
-        flags = self._zeros.new_zeros(2 * samples, self.num_envs, dtype=torch.bool).unbind()
-        rows_by_name: dict[str, Sequence[Any]] = {
+        infos_of_block: dict[str, Sequence[Any]] = {
             "output": output.unbind(),
             "setpoint": setpoint.clone(memory_format=torch.contiguous_format).unbind(),
             "error": error.unbind(),
             "noise": noise.unbind(),
         }
+        loads: Sequence[Tensor] = [self._zeros] * samples
         if load is not None:
-            # A copy, as the caller may overwrite the infos.
-            rows_by_name["disturbance"] = load.clone().unbind()
-            self._loads.extend(load.unbind())
+            loads = load.unbind()
+            infos_of_block["disturbance"] = load.clone().unbind()
         if self.parameters.drifts:
-            rows_by_name |= zip(FACTORS, zip(*factors, strict=True), strict=True)
+            gain_factors, time_constant_factors = zip(*factors, strict=True)
+            infos_of_block["gain_factor"] = gain_factors
+            infos_of_block["time_constant_factor"] = time_constant_factors
+
+        rewards = self._rewards(error).unbind()
+        flags = self._zeros.new_zeros(2 * samples, self.num_envs, dtype=torch.bool).unbind()
+        terminations = flags[:samples]
+        truncations = flags[samples:]
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        masks = dict.fromkeys(self._masks, everyone)
+        masks = {f"_{name}": everyone for name in self._info_names}
         for k in reversed(range(samples)):
-            infos = {name: rows[k] for name, rows in rows_by_name.items()}
-            self._ahead.append((rewards[k], flags[k], flags[samples + k], infos | masks))
+            infos = {name: rows[k] for name, rows in infos_of_block.items()}
+            step = _Step(rewards[k], terminations[k], truncations[k], infos | masks, loads[k])
+            self._ahead.append(step)
 
     def _rewards(self, error: Tensor) -> Tensor:
         """Return the rewards of errors, degC, of any shape, without the cost of moves."""
@@ -274,58 +295,50 @@ class MiddlePointTorchEnv(BatchEnv):
         return error.abs().mul_(-1.0 / scale)
 
     def _begin(self, mask: Mask) -> dict[str, Tensor]:
-        """Begin an episode of the plants in the mask; return the infos at k = 0 that are not 0.
+        """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
 
-        The infos are tensors of shape (num_envs,); elements of plants outside the mask have no
-        meaning.
+        Infos that are always 0 at k = 0 are left out. The infos are tensors of shape
+        (num_envs,), in which elements of other plants have no meaning.
         """
-        flags = self._as_array(mask)
-        rows_to_drop = len(self._ahead)
-        self._ahead = []
+        restart = Restart(self._as_array(mask), unused_rows=len(self._ahead))
         if mask.all():
-            # If all plants are reset, no plant needs past samples. Signals that were external
-            # in the last episode, but are random from now on, have no samples of the latest
-            # block to drop.
-            rows_to_drop = 0
+            # No plant needs past samples. Nor can every signal drop rows: a random signal that
+            # now takes the place of an external signal has not computed the latest block.
+            restart = restart._replace(unused_rows=0)
             self.detach()
-        first_infos = self._episodes.reset(flags, self._clock, self._starts, self._external)
-        self._plants.reset(flags, self._clock - self._episodes.starts, rows_to_drop)
-        at_rest: dict[str, Tensor] = {}
+        self._ahead = []
+        first_infos = self._episodes.reset(restart, self._clock, self._starts, self._external)
+        self._plants.reset(restart, self._clock - self._episodes.starts)
+        first_values: dict[str, Tensor] = {}
         for name, signal in self._signals.items():
-            at_rest[name] = signal.reset(flags, rows_to_drop)
-        self._loads.reset(flags, rows_to_drop)
-        setpoint = at_rest["setpoint"]
+            first_values[name] = signal.reset(restart)
+        setpoint = first_values["setpoint"]
+        self._load = self._load.masked_fill(restart.mask, 0.0)
         numbers = self._episodes.numbers
         rest_action = self._zeros + action_from_command(0.0, numbers["u_min"], numbers["u_max"])
-        self._action = torch.where(flags, rest_action, self._action)
-        self._window.reset(flags, rows_to_drop, setpoint, rest_action)
+        self._action = torch.where(restart.mask, rest_action, self._action)
+        self._window.reset(restart, setpoint, rest_action)
         first_infos["setpoint"] = setpoint
         first_infos["error"] = setpoint
         if self.parameters.drifts:
             first_infos |= {name: self._zeros + numbers[name] for name in FACTORS}
         return first_infos
 
-    def _final(self, ended: Mask, observations: Tensor) -> Tensor:
-        """Return the last observations of plants whose episode has just ended, and 0 elsewhere.
+    def _final_observations(self, ended: Mask, observations: Tensor) -> Tensor:
+        """Return the rows of observations of the plants in `ended`, and 0 for other plants.
 
-        `ended` is True for these plants, shape (num_envs,). `observations`, and the result,
-        have the shape (num_envs, size).
+        `observations`, and the result, have the shape (num_envs, size).
         """
         return torch.where(self._as_array(ended)[:, None], observations, 0)
 
     def _as_array(self, values: NDArray[Any]) -> Tensor:
-        """Return a mask or integers, shape (num_envs,), as a new tensor on the device."""
-        on_host = torch.from_numpy(values)
-        on_device: Tensor = torch.empty(self.num_envs, dtype=on_host.dtype, device=self.device)
-        return on_device.copy_(on_host, non_blocking=True)  # without waiting for the device
+        """Return a NumPy array of shape (num_envs,) as a new tensor on the device."""
+        return copy_to_device(values, self.device)
 
     def _hidden_state(self) -> tuple[dict[str, Any], Tensor]:
         """Return the drawn plant numbers by name, and the load w, degC, for `plant_state`."""
         numbers = {name: self._episodes.numbers[name] for name in self.parameters.ranges}
-        load = self._zeros
-        if self.parameters.is_disturbed:
-            load = self._loads.rows[-1 - len(self._ahead)]
-        return numbers, load
+        return numbers, self._load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Check the seed and the options of a `reset` of the plants in `mask`, and apply both.
@@ -335,15 +348,17 @@ class MiddlePointTorchEnv(BatchEnv):
         """
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
             reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
-        if "reset_mask" in options:
-            if "signals" in options:
-                raise ValueError("options['signals'] needs a reset of all plants, without mask")
-        else:
-            self._external = read_signals(options.get("signals"), self.parameters, self._zeros)
-            signals = {name: self._external[name] for name in SIGNALS if name in self._external}
-            self._signals = {**self._drawn_signals, **signals}
-            last_samples = [signal.last_sample for signal in signals.values()]
-            self._last_sample = min(last_samples, default=UNLIMITED)
+        if "reset_mask" in options and "signals" in options:
+            raise ValueError("options['signals'] needs a reset of all plants, without mask")
+        if "reset_mask" not in options:  # external signals last until the next such reset
+            self._external = read_external(options.get("signals"), self.parameters, self._zeros)
+            self._signals = {**self._own_signals}
+            last_samples: list[int] = []
+            for name, values in self._external.items():
+                if name in SIGNAL_NAMES:
+                    self._signals[name] = values
+                    last_samples.append(values.last_sample)
+            self._last_sample = min(last_samples, default=None)
         if seed is not None:
             self._episodes.generator.manual_seed(int(seed))
         self._np_random_seed = self._episodes.generator.initial_seed()
@@ -354,36 +369,42 @@ class MiddlePointTorchEnv(BatchEnv):
         A ValueError is raised if the actions do not have the shape (num_envs, 1), if an action
         is not finite (on the CPU), or if an external signal has ended.
         """
-        columns = actions
+        column = actions
         if not (isinstance(actions, Tensor) and actions.dtype is self.dtype):
-            columns = as_tensor(actions, self._zeros)
-        if columns is None or columns.shape != (self.num_envs, 1):
+            column = as_tensor(actions, self._zeros)
+        if column is None or column.shape != (self.num_envs, 1):
             reject("actions", actions, f"numbers, shape ({self.num_envs}, 1)")
-        if columns.requires_grad and not self.differentiable:
-            columns = columns.detach()
-        a: Tensor = columns.reshape(-1)
+        if column.requires_grad and not self.differentiable:
+            column = column.detach()
+        a: Tensor = column.reshape(-1)
         if self._ended is not None:
             a = a.masked_fill(self._as_array(self._ended), 0.0)
         if self.checks_actions:
             # The sum of squares, which is fast, is finite if all actions are finite and none is
             # huge.
-            values = a.detach() if a.requires_grad else a
+            values = a
+            if a.requires_grad:
+                values = a.detach()
             if not math.isfinite(values.dot(values).item()) and not values.isfinite().all():
                 reject("actions", actions, "finite")
-        if self._last_sample < UNLIMITED:
-            ages = self._clock - self._starts
-            if self._ended is not None:  # this step resets the plants that have ended
-                ages = ages[~self._ended]
-            if len(ages) and ages.max() >= self._last_sample:
-                raise ValueError(
-                    f"options['signals'] end at sample {self._last_sample} of an episode, and "
-                    "the step leads to a later sample"
-                )
+        if self._last_sample is not None:
+            self._check_signals_go_on(self._last_sample)
         return a
+
+    def _check_signals_go_on(self, last_sample: int) -> None:
+        """Raise a ValueError if the next step of some plant leads beyond k = `last_sample`."""
+        ages = self._clock - self._starts
+        if self._ended is not None:  # the step resets these plants
+            ages = ages[~self._ended]
+        if len(ages) and ages.max() >= last_sample:
+            raise ValueError(
+                f"options['signals'] end at sample {last_sample} of an episode, and the step "
+                "leads to a later sample"
+            )
 
 
 def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePointTorchEnv:
-    """Make many plants of an id or a spec, as `gymnasium.make_vec` does in NumPy.
+    """Make many plants of an id or a spec in PyTorch, as `gymnasium.make_vec` does in NumPy.
 
     Parameters
     ----------
@@ -397,119 +418,25 @@ def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePoint
     Returns
     -------
     MiddlePointTorchEnv
-        The plants. Their `spec` makes one of these plants in NumPy, as in
-        `mptc_gym.evaluate(policy, plants.spec)`.
+        The plants. The `spec` of the environment describes one plant in NumPy, as
+        `mptc_gym.evaluate(policy, envs.spec)` needs.
 
     Raises
     ------
     ValueError
         If the id is unknown or of another environment, or an argument is out of range.
     """
-    of_plant = {name: value for name, value in arguments.items() if name in ARGUMENTS}
+    single_arguments = {name: arguments[name] for name in ARGUMENTS if name in arguments}
     if "max_episode_steps" in arguments:
         limit = arguments["max_episode_steps"]
-        of_plant["max_episode_steps"] = -1 if limit is None else limit
-    single = make_one(env, of_plant)
-    plant, spec = single.unwrapped, cast("EnvSpec", single.spec)
+        single_arguments["max_episode_steps"] = -1 if limit is None else limit
+    single = make_one(env, single_arguments)
+    plant = single.unwrapped
+    spec = cast("EnvSpec", single.spec)
     if not isinstance(plant, MiddlePointEnv) or spec.additional_wrappers:
         reject("env", env, "the id or the spec of a MiddlePointEnv, without wrappers")
-    arguments = {
-        **asdict(plant.parameters),
-        "max_episode_steps": spec.max_episode_steps,
-        **arguments,
-    }
-    plants = MiddlePointTorchEnv(num_envs, **arguments)
-    plants.spec = spec
-    return plants
-
-
-class _Window:
-    """The observations of all plants.
-
-    Parameters
-    ----------
-    windows
-        How many set points, errors, outputs and past actions an observation holds.
-    zeros
-        Zeros of the device and type to use, shape (n,).
-    """
-
-    def __init__(self, windows: Sequence[int], zeros: Tensor) -> None:
-        *self._windows, self._past_actions = windows
-        self._zeros = zeros
-        # The histories of set points, errors and outputs, degC.
-        self._histories = [History(zeros, window) for window in self._windows]
-        self._actions = zeros.expand(self._past_actions, -1)  # the newest first
-        # Observations of the rest of the block, without past actions, the next sample last.
-        self._stacked: list[Tensor] = []
-
-    def reset(
-        self, mask: Tensor, rows_to_drop: int, setpoint: Tensor, rest_action: Tensor
-    ) -> None:
-        """Begin an episode of some plants, at rest. All tensors have the shape (n,).
-
-        Parameters
-        ----------
-        mask
-            True for the plants to reset.
-        rows_to_drop
-            How many samples at the end of the latest block are dropped, as the environment has
-            not returned them.
-        setpoint
-            Set points y_d(0), degC.
-        rest_action
-            Actions for a flow of 0 t/h.
-        """
-        setpoints, errors, outputs = self._histories
-        setpoints.reset(mask, rows_to_drop, newest=setpoint)
-        errors.reset(mask, rows_to_drop, newest=setpoint)
-        outputs.reset(mask, rows_to_drop)
-        self._actions = torch.where(mask, rest_action.clamp(-1.0, 1.0), self._actions)
-
-    def extend(self, *blocks: Tensor) -> None:
-        """Add a block of set points, errors and outputs, in this order.
-
-        Each tensor in `blocks` has the shape (samples, n), degC.
-        """
-        for history, window, block in zip(self._histories, self._windows, blocks, strict=True):
-            if window:
-                history.extend(block.unbind())
-        samples = len(blocks[0])
-        self._stacked = self._stack(samples, first_place=1)[::-1]
-
-    def next(self, a: Tensor) -> Tensor:
-        """Return the observations of the next sample of the block, shape (n, size).
-
-        `a` are the actions that led to this sample, shape (n,).
-        """
-        observations = self._stacked.pop()
-        if self._past_actions:
-            newest = a.clamp(-1.0, 1.0)[None]
-            self._actions = torch.cat((newest, self._actions))[:-1]
-            observations = torch.cat((observations, self._actions))
-        return observations.t()
-
-    def present(self) -> Tensor:
-        """Return the observations after a reset, shape (n, size)."""
-        return torch.cat((*self._stack(1, first_place=0), self._actions)).t()
-
-    def detach(self) -> None:
-        """Cut the gradient graph from stored observations to earlier actions."""
-        for history in self._histories:
-            history.detach()
-        self._stacked = [observations.detach() for observations in self._stacked]
-        self._actions = self._actions.detach()
-
-    def _stack(self, samples: int, first_place: int) -> list[Tensor]:
-        """Return the observations of `samples` samples, in tensors of shape (size, n).
-
-        Past actions are left out. The first observation begins at index `first_place` of the
-        histories.
-        """
-        newest_first: list[Tensor] = []
-        for place in range(first_place, first_place + samples):
-            for history, window in zip(self._histories, self._windows, strict=True):
-                newest_first += history.rows[place : place + window][::-1]
-        if not newest_first:  # the observation holds past actions alone
-            return [self._zeros.new_empty(0, len(self._zeros))] * samples
-        return [*torch.stack(newest_first).view(samples, -1, len(self._zeros)).unbind()]
+    arguments_of_id = asdict(plant.parameters)
+    arguments_of_id["max_episode_steps"] = spec.max_episode_steps
+    envs = MiddlePointTorchEnv(num_envs, **(arguments_of_id | arguments))
+    envs.spec = spec
+    return envs

@@ -1,8 +1,8 @@
-"""Keep the episodes of many plants in PyTorch: times, plant numbers, values from outside.
+"""Keep the episodes of many plants in PyTorch: times, plant numbers, external values.
 
-The environment computes blocks of samples ahead. Times are counted in steps of the environment.
-A reset of some plants may come before the environment has returned all samples of a block. The
-unused samples at the end of the block are then dropped, and computed anew for all plants.
+Times are counted in steps of the environment, which computes blocks of samples ahead. If some
+plants are reset before `step` has returned all samples of a block, the unused samples at the
+end of the block are dropped, and computed anew for all plants.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,8 +17,8 @@ from mptc_gym.plant.checks import reject
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL
 from mptc_gym.plant.parameters import Parameters
 
-LONGEST = 64  # most samples in a block, which bounds the memory of a block
-SIGNALS = ("noise", "setpoint", "disturbance", "measurement_noise")  # signals from outside
+MOST_BLOCK_SAMPLES = 64  # most samples in a block, which bounds the memory of a block
+SIGNAL_NAMES = ("noise", "setpoint", "disturbance", "measurement_noise")
 Number = float | Tensor  # a float for all plants, or an element for each plant, shape (n,)
 
 
@@ -33,13 +33,20 @@ def as_tensor(values: Any, like: Tensor) -> Tensor | None:
         return None
 
 
+def copy_to_device(array: NDArray[Any], device: torch.device) -> Tensor:
+    """Return a NumPy array as a new tensor on a device, without waiting for the device."""
+    on_host = torch.from_numpy(array)
+    on_device: Tensor = torch.empty(on_host.shape, dtype=on_host.dtype, device=device)
+    return on_device.copy_(on_host, non_blocking=True)
+
+
 class Block(NamedTuple):
     """A block of consecutive samples that are computed at once: one row for each sample."""
 
     first_time: int  # time of row 0, in steps of the environment
     samples: int  # number of rows
     starts: Tensor | int  # time at k = 0 of each plant, shape (n,), or one time for all plants
-    due_rows: list[int]  # rows at which the load and the drifts of some plant are due to change
+    due_rows: list[int]  # rows at which the load or the dynamics of some plant change
 
     def age(self, row: int) -> Tensor | int:
         """Return the sample k of a row, shape (n,), or one number for all plants."""
@@ -48,30 +55,30 @@ class Block(NamedTuple):
     def ages(self, device: torch.device) -> Tensor:
         """Return the sample k of all rows, on the given device.
 
-        The shape is (samples, n), or (samples, 1) if the episodes of all plants began at one
-        time.
+        The shape is (samples, n), or (samples, 1) if all episodes began at one time.
         """
         return torch.arange(self.samples, device=device)[:, None] + self.age(0)
 
 
-class History:
-    """The latest values of a quantity of n plants: one tensor of shape (n,) for each sample.
+class Restart(NamedTuple):
+    """The start of an episode of some plants, perhaps in the middle of a block."""
 
-    Parameters
-    ----------
-    zeros
-        Zeros of the device and type to use, shape (n,).
-    length
-        How many samples before the latest block are kept.
+    mask: Tensor  # True for the plants whose episode begins, shape (n,)
+    unused_rows: int  # rows at the end of the latest block that no `step` has returned
+
+
+class History:
+    """The latest values of a quantity of n plants.
 
     Attributes
     ----------
     rows : list of Tensor
-        The values, the oldest first: the values of the `length` samples before the latest
-        block, then the values of the block.
+        The values, one tensor of shape (n,) for each sample, the oldest first: some samples
+        before the latest block, then the samples of the block.
     """
 
     def __init__(self, zeros: Tensor, length: int) -> None:
+        """Begin with values of 0, shape (n,), and keep `length` samples before each block."""
         self.rows = [zeros] * length
         self._length = length
 
@@ -79,24 +86,16 @@ class History:
         """Add the values of a block, each of shape (n,), and forget values of older blocks."""
         self.rows = [*self.rows[len(self.rows) - self._length :], *block]
 
-    def reset(self, mask: Tensor, rows_to_drop: int, newest: Tensor | None = None) -> None:
-        """Begin an episode of the plants in a mask, with zeros before sample k = 0.
+    def reset(self, restart: Restart, newest: Tensor | None = None) -> None:
+        """Drop the unused rows, and set the values of the plants in `restart.mask` to zero.
 
-        Parameters
-        ----------
-        mask
-            True for the plants to reset, shape (n,).
-        rows_to_drop
-            How many samples at the end of the latest block are dropped, as the environment has
-            not returned them.
-        newest
-            The values at k = 0, shape (n,); None stands for zeros.
+        If `newest`, shape (n,), is given, these plants have the values `newest` at k = 0.
         """
-        end = len(self.rows) - rows_to_drop
+        end = len(self.rows) - restart.unused_rows
         rows = self.rows[end - self._length : end]
-        self.rows = [row.masked_fill(mask, 0.0) for row in rows]
+        self.rows = [row.masked_fill(restart.mask, 0.0) for row in rows]
         if self.rows and newest is not None:
-            self.rows[-1] = torch.where(mask, newest, self.rows[-1])
+            self.rows[-1] = torch.where(restart.mask, newest, self.rows[-1])
 
     def detach(self) -> None:
         """Cut the gradient graph from the values to earlier actions."""
@@ -105,13 +104,6 @@ class History:
 
 class Episodes:
     """The present episodes of n plants: when the episodes began, and the plant numbers.
-
-    Parameters
-    ----------
-    parameters
-        The arguments of the environment.
-    zeros
-        Zeros of the device and type to use, shape (n,).
 
     Attributes
     ----------
@@ -127,6 +119,10 @@ class Episodes:
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
+        """Prepare the plant numbers of n plants, before the first reset.
+
+        `zeros`, shape (n,), has the device and the type of all tensors.
+        """
         self.zeros = zeros
         self.generator = torch.Generator(zeros.device)
         self.generator.seed()  # from the operating system, until `reset` gets a seed
@@ -142,56 +138,57 @@ class Episodes:
             self.numbers[name] = zeros + lowest if name in tensor_names else float(lowest)
         self.starts: Tensor | int = 0
         # Load and drifting dynamics change when the age of an episode is a multiple of
-        # `DRIFT_INTERVAL`: when the time, divided by `DRIFT_INTERVAL`, leaves one of these
-        # remainders. The remainders are on the host, so that nothing waits for the device.
+        # `DRIFT_INTERVAL`: when the time, divided by `DRIFT_INTERVAL`, leaves the remainder of
+        # an episode's start. The remainders are on the host, so that nothing waits for the
+        # device.
         self._due_remainders: set[int] = set()
 
     def reset(
         self,
-        mask: Tensor,
+        restart: Restart,
         time: int,
         starts: NDArray[np.int64],
-        external: Mapping[str, "External"],
+        external: Mapping[str, "ExternalValues"],
     ) -> dict[str, Tensor]:
         """Begin an episode of some plants, and return the plant numbers that are ranges.
 
         Parameters
         ----------
-        mask
-            True for the plants whose episode begins, shape (n,).
+        restart
+            Which plants begin an episode.
         time
             The present time, in steps of the environment.
         starts
-            The time at which each plant's present episode began, shape (n,): `time` for the
-            plants in the mask.
+            The time at which each plant's episode began, shape (n,): `time` for plants whose
+            episode begins.
         external
-            The plant numbers that come from outside instead of being random, by name.
+            Plant numbers from outside, by name, in place of random numbers.
 
         Returns
         -------
         dict of Tensor
-            The plant numbers by name, shape (n,). Only the elements of plants in the mask have
-            a meaning.
+            The plant numbers by name, shape (n,). Elements of other plants have no meaning.
         """
         numbers: dict[str, Tensor] = {}
         for name, (low, high) in self._ranges.items():
             is_integer = isinstance(low, int)
             if name in external:
-                values = external[name].reset(mask)
+                values = external[name].reset(restart)
             else:
-                values = self.draw(low, high, is_integer)
-            self.numbers[name] = torch.where(mask, values, self.numbers[name])
+                values = self.draw(low, high, is_integer=is_integer)
+            self.numbers[name] = torch.where(restart.mask, values, self.numbers[name])
             numbers[name] = values.to(torch.int64) if is_integer else values
-        if (starts == time).all():
-            self.starts = time
-        else:
-            previous_starts = torch.zeros_like(mask, dtype=torch.int64) + self.starts
-            self.starts = previous_starts.masked_fill(mask, time)
+        self.starts = time
+        if (starts != time).any():
+            self.starts = copy_to_device(starts, self.zeros.device)
         self._due_remainders = set(np.unique(starts % DRIFT_INTERVAL).tolist())
         return numbers
 
     def block(self, first_time: int, samples: int) -> Block:
-        """Return the block of `samples` samples from the time `first_time` on."""
+        """Return the block of `samples` samples from the time `first_time` on.
+
+        The block also lists the rows at which the load or the dynamics of some plant change.
+        """
         due_rows = [
             row
             for row in range(samples)
@@ -204,11 +201,10 @@ class Episodes:
         numbers = self.zeros.new_empty(rows, len(self.zeros))
         return numbers.uniform_(-1.0, 1.0, generator=self.generator)
 
-    def draw(self, low: float, high: float, is_integer: bool) -> Tensor:
-        """Return random numbers, uniform from `low` to `high`, both included.
+    def draw(self, low: float, high: float, *, is_integer: bool) -> Tensor:
+        """Return random numbers, uniform from `low` to `high`, both included, shape (n,).
 
-        The numbers are integers if `is_integer` is True. The result has the shape (n,) and
-        always the floating-point type of `zeros`.
+        The numbers are integers if `is_integer` is True, but have the type of `zeros`.
         """
         numbers = torch.empty_like(self.zeros)
         numbers.uniform_(low, high + is_integer, generator=self.generator)
@@ -217,37 +213,34 @@ class Episodes:
         return numbers.clamp(max=high)
 
 
-class External:
+class ExternalValues:
     """A signal, or a plant number, that is read from a tensor instead of being random.
 
-    After the last episode in the tensor, the first episode follows again. After the last sample
-    of an episode, the value of this sample is held. A plant number has one sample, which
-    `reset` returns.
-
-    Parameters
-    ----------
-    values
-        The values of the signal, degC, or of the plant number, shape (episodes, samples, n).
+    After its last episode, the tensor is read from its first episode on again. After the last
+    sample of an episode in the tensor, a signal keeps its last value.
 
     Attributes
     ----------
     last_sample : int
-        The last sample k of an episode that has a value of its own.
+        The last sample k of an episode for which the tensor has a value.
     """
 
     def __init__(self, values: Tensor) -> None:
+        """Store values, degC, of a signal of n plants, shape (episodes, samples, n).
+
+        A plant number, such as a delay, is a signal of one sample in the number's own unit.
+        """
         self._values = values
         # The index of each plant's present episode, shape (n,).
         self._episode = torch.full_like(values[0, 0], -1, dtype=torch.int64)
         self.last_sample = values.shape[1] - 1
 
-    def reset(self, mask: Tensor, rows_to_drop: int = 0) -> Tensor:
-        """Begin the next episode of the plants in `mask`; return the values at k = 0.
+    def reset(self, restart: Restart) -> Tensor:
+        """Begin the next episode of the plants in `restart.mask`; return values at k = 0.
 
-        The values have the shape (n,). `rows_to_drop` is an argument of every signal, but is
-        not needed: `next` reads the values by the sample k alone.
+        The values have the shape (n,).
         """
-        self._episode = self._episode + mask
+        self._episode = self._episode + restart.mask
         return self._at(torch.zeros_like(self._episode)[None])[0]
 
     def next(self, block: Block) -> Tensor:
@@ -260,30 +253,32 @@ class External:
         `ages` are the samples k, of shape (samples, n), or (samples, 1) for all plants.
         """
         episodes, samples, _ = self._values.shape
-        rows = self._episode % episodes * samples + ages.clamp(max=samples - 1)
-        return self._values.flatten(0, 1).gather(0, rows)
+        # With episodes and samples as one axis, an episode begins every `samples` rows.
+        values = self._values.flatten(0, 1)
+        first_rows = (self._episode % episodes) * samples
+        return values.gather(0, first_rows + ages.clamp(max=samples - 1))
 
 
-def read_signals(signals: Any, parameters: Parameters, zeros: Tensor) -> dict[str, External]:
-    """Return the signals and parameters of the plants in `options["signals"]` of a reset.
+def read_external(
+    signals: Any, parameters: Parameters, zeros: Tensor
+) -> dict[str, ExternalValues]:
+    """Return the signals and plant numbers in `options["signals"]` of a reset, by name.
+
+    A ValueError is raised for an unknown name, and for values that have the wrong shape, are
+    not finite or out of range.
 
     Parameters
     ----------
     signals
-        A dict of values by name, as in `MiddlePointTorchEnv`; None for no signals from outside.
+        `options["signals"]`, as in `MiddlePointTorchEnv`; None if there is no such option.
     parameters
         The arguments of the environment.
     zeros
         Zeros of the device and type to use, shape (n,).
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown, or if values have the wrong shape, are not finite or out of range.
     """
     if signals is None:
         return {}
-    names = {*SIGNALS, *parameters.ranges}
+    names = {*SIGNAL_NAMES, *parameters.ranges}
     if not parameters.is_disturbed:
         names.remove("disturbance")
     allowed = f"a dict with some of {sorted(names)}"
@@ -291,58 +286,64 @@ def read_signals(signals: Any, parameters: Parameters, zeros: Tensor) -> dict[st
         reject("options['signals']", signals, allowed)
     if not signals or not names >= {*signals}:
         reject("options['signals']", [*signals], allowed)
-    checked: dict[str, External] = {}
+    n = len(zeros)
+    external: dict[str, ExternalValues] = {}
     for name, value in signals.items():
-        ends = parameters.ranges.get(name)
         path = f"options['signals'][{name!r}]"
-        checked[name] = External(_read_values(path, value, ends, zeros))
-    return checked
+        if name in parameters.ranges:
+            values = _finite_values(path, value, zeros, 1, f"({n},)")
+            _check_range(path, values, parameters.ranges[name])
+            values = values[:, None]  # adds the axis of samples: a plant number has one sample
+        else:
+            values = _finite_values(path, value, zeros, 2, f"(samples, {n})")
+        external[name] = ExternalValues(values)
+    return external
 
 
-def _read_values(
-    path: str, value: Any, ends: tuple[float, float] | None, zeros: Tensor
-) -> Tensor:
-    """Return the values of a signal or a plant number, shape (episodes, samples, n).
+def _finite_values(path: str, value: Any, zeros: Tensor, dimensions: int, shape: str) -> Tensor:
+    """Return numbers of the user as a tensor that has a leading dimension of episodes.
+
+    A ValueError is raised if `value` holds no finite numbers, or has a wrong shape.
 
     Parameters
     ----------
     path
-        What an error message calls the values.
+        What an error message calls the numbers.
     value
-        Numbers of shape (samples, n) for a signal, or (n,) for a plant number, or with a
-        leading dimension of episodes.
-    ends
-        The lowest and the highest value of a plant number; None stands for a signal.
+        The numbers, with or without the dimension of episodes.
     zeros
         Zeros of the device and type to use, shape (n,).
-
-    Raises
-    ------
-    ValueError
-        If the values are no finite numbers, or are of a wrong shape or out of range.
+    dimensions
+        How many dimensions the numbers of one episode have, of which the last has the size n.
+    shape
+        The shape of the numbers of one episode, for an error message.
     """
-    n = len(zeros)
-    shape = f"(samples, {n})" if ends is None else f"({n},)"
     values = as_tensor(value, zeros)
     if values is None:
         reject(path, value, "numbers")
     shape_of_values = tuple(values.shape)
-    if ends is not None and values.ndim:
-        values = values.unsqueeze(-2)  # adds the axis of samples: a plant number has one sample
-    if values.ndim == 2:
-        values = values[None]  # adds the axis of episodes, of length 1
-    if values.ndim != 3 or values.shape[-1] != n or not values.numel():
+    if values.ndim == dimensions:
+        values = values[None]
+    has_shape = values.ndim == dimensions + 1 and values.shape[-1] == len(zeros)
+    if not has_shape or not values.numel():
         raise ValueError(
             f"{path} must have the shape {shape}, or one more dimension before it, of "
             f"episodes, got {shape_of_values}"
         )
     if not values.isfinite().all():
         raise ValueError(f"{path} must be finite")
-    if ends is not None:
-        low, high = values.new_tensor(ends)
-        fits = (low <= values) & (values <= high)
-        if isinstance(ends[0], int):
-            fits &= values == values.round()
-        if not fits.all():
-            reject(path, value, f"within the range of this argument, {list(ends)}")
     return values
+
+
+def _check_range(path: str, values: Tensor, ends: tuple[float, float]) -> None:
+    """Raise a ValueError if a plant number is outside the range from which it is drawn.
+
+    `path` is what the message calls the plant number. If the ends of the range are integers,
+    the plant number must be an integer.
+    """
+    low, high = values.new_tensor(ends)
+    fits = (low <= values) & (values <= high)
+    if isinstance(ends[0], int):
+        fits &= values == values.round()
+    if not fits.all():
+        reject(path, values, f"within the range of this argument, {list(ends)}")

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics, least_effective_command
 from mptc_gym.plant.parameters import Parameters, PlantNumbers
-from mptc_gym.torch_env.episodes import Block, Episodes, History, Number
+from mptc_gym.torch_env.episodes import Block, Episodes, History, Number, Restart
 
 
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
@@ -45,111 +45,107 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
     limited = torch.clamp(command, u_min, u_max)  # type: ignore[arg-type]
     # 1 where the command passes the dead zone, otherwise 0: a product is much faster than an
     # unpredictable branch.
-    if not command.requires_grad:
-        return limited.mul_(command.abs().gt_(edge))
     passes = command.detach().abs().gt_(edge)
+    if not command.requires_grad:
+        return limited.mul_(passes)
     # limited + constant * (passes - 1) has the value of limited * passes, but the gradient of
     # `limited`.
     return torch.addcmul(limited, limited.detach(), passes.sub_(1.0))
 
 
 class TorchPlants:
-    """Many plants with their actuators in PyTorch, with gradients if the actions have any.
-
-    Parameters
-    ----------
-    parameters
-        The arguments of the environment.
-    episodes
-        The present episodes of the plants, which hold the plant numbers.
+    """n plants with their actuators in PyTorch, with gradients if the actions have any.
 
     Attributes
     ----------
     most_samples : int
         The most samples in a block: d + 1, with d the shortest delay that can be drawn. The
-        temperatures of the d + 1 samples after an action follow from the actions so far.
+        temperatures of the d + 1 samples after an action do not depend on later actions.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
+        """Prepare plants whose numbers, such as delay and dead zone, `episodes` hold."""
         self._episodes = episodes
         self._zeros = episodes.zeros
         self._dynamics = Dynamics(parameters)
         self._drifts = parameters.drifts
-        self._changes_dynamics = parameters.changes_dynamics
         self._drift_samples = parameters.drift_samples
         self._beta = tuple(parameters.b)
-        shortest, self._longest = map(int, parameters.range_of("delay"))
-        self.most_samples = shortest + 1
+        shortest_delay, self._longest_delay = map(int, parameters.range_of("delay"))
+        self.most_samples = shortest_delay + 1
         # The applied flows that terms of the polynomial B still need, t/h, the oldest first.
-        flows = self._longest + len(self._beta)
+        flows = self._longest_delay + len(self._beta)
         self._flows = deque([self._zeros] * flows, flows)
         # The temperatures, degC. The polynomial A needs as many past temperatures as A has
         # coefficients from z^-1 on.
         self._outputs = History(self._zeros, len(parameters.a) - 1)
 
-    def reset(self, mask: Tensor, age: Tensor | int, rows_to_drop: int) -> None:
-        """Bring some plants to rest, with the plant numbers of the present episodes.
+    def reset(self, restart: Restart, age: Tensor | int) -> None:
+        """Bring the plants in `restart.mask` to rest, with the plant numbers of a new episode.
 
-        Parameters
-        ----------
-        mask
-            True for the plants to reset, shape (n,).
-        age
-            The sample k of all plants, shape (n,), or one number for all plants; 0 for plants
-            in the mask.
-        rows_to_drop
-            How many samples at the end of the latest block are dropped, as the environment has
-            not returned them.
+        Plant numbers are delay, dead zone, limits, gain and so on. `age` is the sample k of
+        each plant, shape (n,), or one number for all plants.
         """
-        self._outputs.reset(mask, rows_to_drop)
-        self._flows.extend(torch.stack([*self._flows]).masked_fill_(mask, 0.0).unbind())
+        self._outputs.reset(restart)
+        flows = torch.stack([*self._flows]).masked_fill_(restart.mask, 0.0)
+        self._flows.extend(flows.unbind())  # the deque drops as many old flows
         self._reset_actuator()
         self._reset_delays()
         numbers = PlantNumbers(**self._episodes.numbers)
-        self._initial_factors = self._dynamics.factors(numbers, 0)
+        self._factors: tuple[Number, ...] = self._dynamics.factors(numbers, 0)
         if self._drifts:
             # Gain factor and time constant factor at k = 0, and their total change by drift.
+            self._initial_factors = [self._zeros + initial for initial in self._factors]
             final_factors = self._dynamics.factors(numbers, self._drift_samples)
-            self._drift = [
-                (self._zeros + initial, self._zeros + (final - initial))
-                for initial, final in zip(self._initial_factors, final_factors, strict=True)
+            self._factor_changes = [
+                self._zeros + (final - initial)
+                for initial, final in zip(self._factors, final_factors, strict=True)
             ]
         self._update_dynamics(age)
 
     def _reset_actuator(self) -> None:
-        """Compute what `apply` needs of limits and dead zone, after a reset changed both."""
+        """Compute what `apply` needs of the limits and dead zones of the present episodes."""
         numbers = self._episodes.numbers
         u_min = numbers["u_min"]
         u_max = numbers["u_max"]
         self._limits = u_min, u_max
         self._middle = self._zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
-        rounding = 2.0**-21 if self._zeros.dtype == torch.float32 else 2.0**-50
+        # Eight roundings, each of half an eps: see `least_effective_command`.
+        rounding = 4.0 * torch.finfo(self._zeros.dtype).eps
         self._edge = least_effective_command(numbers["dead_zone"], u_min, u_max, rounding)
 
     def _reset_delays(self) -> None:
-        """Compute the indices of each plant's delayed flows in all flows, if delays differ."""
-        self._places: Tensor | None = None  # indices in the flattened flows
+        """Compute the indices at which `_response` finds the delayed flows of each plant.
+
+        The indices, shape (rows, n), refer to the flows of all plants in one flat tensor.
+        Without random delays, `_response` needs no indices.
+        """
+        self._delayed_at: Tensor | None = None
         delay = self._episodes.numbers["delay"]
         if isinstance(delay, Tensor):
             n = len(self._zeros)
             columns = torch.arange(n, device=delay.device)
             rows = torch.arange(self.most_samples + len(self._beta) - 1, device=delay.device)
-            first_rows = self._longest - delay.to(torch.int64)
-            self._places = (rows[:, None] + first_rows) * n + columns
+            first_rows = self._longest_delay - delay.to(torch.int64)
+            self._delayed_at = (rows[:, None] + first_rows) * n + columns
 
     def _update_dynamics(self, age: Tensor | int) -> None:
-        """Compute gain, time constant and coefficients of the plants at the sample k = `age`.
+        """Compute the factors of past temperatures, past flows and load at sample k = `age`.
 
-        `age` has the shape (n,), or is one number for all plants.
+        The factors are the coefficients of equation (28) of the paper. If gain and time
+        constant drift, the factors change at multiples of `DRIFT_INTERVAL`. `age` has the shape
+        (n,), or is one number for all plants.
         """
-        self._factors: tuple[Number, ...] = self._initial_factors
         if self._drifts:
             if isinstance(age, Tensor):
                 age = age.to(self._zeros.dtype)
             share = self._dynamics.drift_share(age - age % DRIFT_INTERVAL)
             self._factors = tuple(
-                _add_product(initial, share, change) for initial, change in self._drift
+                _add_product(initial, share, change)
+                for initial, change in zip(
+                    self._initial_factors, self._factor_changes, strict=True
+                )
             )
         coefficients = self._dynamics.coefficients(*self._factors)
         self._alpha, self._scale, self._load_gain = coefficients
@@ -194,17 +190,18 @@ class TorchPlants:
         outputs = [*self._outputs.rows]
         factors: list[tuple[Number, ...]] = []
         response = self._response(block.samples)
-        # The rows of the block at which coefficients change; between two changes, the
-        # coefficients are constant.
-        changes = block.due_rows if self._drifts else []
-        for first, end in pairwise(sorted({0, *changes, block.samples})):
-            if first in changes:
+        rows_of_change = block.due_rows if self._drifts else []
+        # Between two of these rows of the block, the coefficients are constant.
+        boundaries = sorted({0, *rows_of_change, block.samples})
+        for first, end in pairwise(boundaries):
+            if first in rows_of_change:
                 self._update_dynamics(block.age(first))
             factors += [self._factors] * (end - first)
+            # The temperatures without the terms of earlier temperatures.
             forced = response[first:end]
             if noise is not None:
                 forced = _add_product(noise[first:end], self._scale, forced)
-            elif self._changes_dynamics:
+            else:
                 forced = forced * self._scale
             if load is not None:
                 forced = _add_product(forced, self._load_gain, load[first:end])
@@ -228,17 +225,19 @@ class TorchPlants:
         The part at sample k is B(z^-1) u_a(k-d), with the polynomial B of equation (28) of the
         paper, applied flow u_a and delay d. `samples` is the number of samples in the block.
         """
-        needed = samples + len(self._beta) - 1
-        if self._places is None:
-            flows = torch.stack([*islice(self._flows, needed)])
+        # One delayed flow for each sample, and before them the flows for further terms of B.
+        rows = samples + len(self._beta) - 1
+        if self._delayed_at is None:
+            delayed_flows = torch.stack([*islice(self._flows, rows)])
         else:
-            older = self._longest - self.most_samples + 1
-            all_flows = torch.stack([*islice(self._flows, older + needed)]).reshape(-1)
-            places = self._places[:needed].reshape(-1)
-            flows = all_flows.index_select(0, places).view(needed, -1)
-        response = flows[-samples:] * self._beta[0]
+            shortest_delay = self.most_samples - 1
+            rows_of_all = rows + self._longest_delay - shortest_delay
+            all_flows = torch.stack([*islice(self._flows, rows_of_all)])
+            indices = self._delayed_at[:rows].reshape(-1)
+            delayed_flows = all_flows.reshape(-1).index_select(0, indices).view(rows, -1)
+        response = delayed_flows[-samples:] * self._beta[0]
         for lag, coefficient in enumerate(self._beta[1:], start=1):
-            earlier = flows[needed - samples - lag : needed - lag]
+            earlier = delayed_flows[rows - samples - lag : rows - lag]
             response = response.add_(earlier, alpha=coefficient)
         return response
 

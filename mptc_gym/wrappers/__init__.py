@@ -19,7 +19,8 @@ from mptc_gym.plant.checks import is_number, one_action, reject
 from mptc_gym.plant.dynamics import action_from_command, float32_action
 from mptc_gym.plant.parameters import Parameters
 
-NUMBERS = "dead_zone", "u_min", "u_max"  # the arguments that describe the actuator, t/h
+# The arguments of the environment that describe the actuator, t/h.
+ACTUATOR_NUMBERS = "dead_zone", "u_min", "u_max"
 
 
 class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructorArgs):
@@ -48,9 +49,9 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     The action space is `Box(-1, 1, (1,), float32)`; actions beyond +-1 are clipped.
     Observation, reward (with `move_weight`) and info are those of the wrapped environment,
     which receives absolute actions: actions that set the flow. A policy must know the wanted
-    flow v, which follows from the newest past action in the observation, so `action_window`
-    must be at least 1. With the default delay of 18 samples, `action_window=20` makes the
-    problem without noise a Markov decision process as long as the set point stays constant.
+    flow v, which follows from the newest past action in the observation: so set `action_window`
+    to at least 1. With the default delay of 18 samples, `action_window=20` makes the problem
+    without noise a Markov decision process as long as the set point stays constant.
 
     Parameters
     ----------
@@ -61,8 +62,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         above 0, up to 2.
     compensate_dead_zone
         False leaves the dead zone as it is. True compensates the dead zone of the plant, or of
-        the present episode if `dead_zone` is a range. A number compensates a dead zone with
-        this number as half width, t/h.
+        the present episode if `dead_zone` is a range. A number is the half width, t/h, of the
+        dead zone to compensate.
 
     Attributes
     ----------
@@ -72,8 +73,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     Raises
     ------
     ValueError
-        If an argument is out of range. Also raised by `step`, if the action is not one finite
-        number; this error leaves the wrapper and the environment unchanged.
+        If an argument is out of range. `step` raises a ValueError if the action is not one
+        finite number, and leaves the wrapper and the environment unchanged.
 
     Examples
     --------
@@ -90,6 +91,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         max_move: float = 0.4,
         compensate_dead_zone: bool | float = False,
     ) -> None:
+        """Wrap one environment; the docstring of the class describes the arguments."""
         parameters = getattr(getattr(env, "unwrapped", None), "parameters", None)
         if isinstance(env, VectorEnv) or not isinstance(parameters, Parameters):
             allowed = "a MiddlePointEnv, wrapped or not; mptc_gym.wrappers.vector takes many"
@@ -100,8 +102,9 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         gymnasium.ActionWrapper.__init__(self, env)
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.increments = max_move, compensate_dead_zone
-        self._numbers = {name: parameters.range_of(name)[0] for name in NUMBERS}
-        self._actuator = Actuator(self._numbers, *self.increments)
+        # Dead zone and limits, t/h; the lowest value of those that a reset draws anew.
+        self._numbers = {name: parameters.range_of(name)[0] for name in ACTUATOR_NUMBERS}
+        self._actuator = Actuator(self._numbers, max_move, compensate_dead_zone)
         self._flow = 0.0  # wanted flow v, t/h
 
     def reset(
@@ -109,11 +112,10 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, and set the wanted flow to 0 t/h.
 
-        `seed` and `options`, and the observation and the info that are returned, are those of
-        the wrapped environment.
+        `seed`, `options`, observation and info are those of the wrapped environment.
         """
         observation, info = self.env.reset(seed=seed, options=options)
-        drawn_numbers = {name: info[name] for name in NUMBERS if name in info}
+        drawn_numbers = {name: info[name] for name in ACTUATOR_NUMBERS if name in info}
         self._actuator = Actuator(self._numbers | drawn_numbers, *self.increments)
         self._flow = 0.0
         return observation, info
@@ -122,21 +124,20 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         return f"<{type(self).__name__}{self.increments}{self.env}>"
 
     def action(self, action: Any) -> NDArray[np.float32]:
-        """Move the wanted flow by an action, and return the absolute action.
+        """Move the wanted flow by an action, and return the action that sets the new flow.
 
-        The argument and the result have the shape (1,). The absolute action is the action of
-        the wrapped environment that sets the flow. A ValueError is raised if the argument is
-        not one finite number.
+        `action` is one number, shape (1,). The result, shape (1,), is the action of the wrapped
+        environment. A ValueError is raised if `action` is not one finite number.
         """
         move = max(-1.0, min(1.0, one_action(action)))
         actuator = self._actuator
-        flow = self._flow + actuator.move * move
+        flow = self._flow + actuator.flow_per_action * move
         self._flow = max(actuator.u_min, min(actuator.u_max, flow))
         return np.array([actuator.action(self._flow)], np.float32)
 
 
 class Actuator:
-    """Dead zone and limits of an actuator, and the actions that make the actuator apply a flow.
+    """Dead zone and limits of one or n actuators, and the actions that command a wanted flow.
 
     Parameters
     ----------
@@ -150,7 +151,7 @@ class Actuator:
     ----------
     u_min, u_max : float or array
         The limits of the actuator, t/h.
-    move : float or array
+    flow_per_action : float or array
         Change of the wanted flow by an action of 1, t/h.
 
     Raises
@@ -169,29 +170,27 @@ class Actuator:
             reject("compensate_dead_zone", zone, "True, False or a number from 0 to 1e9")
         self.u_min = numbers["u_min"]
         self.u_max = numbers["u_max"]
-        # Change of the wanted flow by an action of 1, t/h.
-        self.move = max_move * ((self.u_max - self.u_min) / 2.0)
+        self.flow_per_action = max_move * ((self.u_max - self.u_min) / 2.0)
         self._compensates = zone is not False
-        # The half width of the dead zone that the commands skip, t/h; False, that is 0, without
-        # compensation.
+        # Half width of the dead zone that the commands skip, t/h; unused without compensation.
         self._zone: Any = numbers["dead_zone"] if zone is True else zone
         self._slope_above = self._slope(self.u_max)
         self._slope_below = self._slope(-self.u_min)
 
     def _slope(self, limit: Any) -> Any:
-        """Return the change of the command per change of the wanted flow, as a ratio.
+        """Return the change of the commanded flow per change of the wanted flow, as a ratio.
 
-        `limit` is the magnitude of the limit towards which the flow moves, t/h. The slope is 0
-        for a limit inside the dead zone: equation (29) of the paper limits a command on the
-        edge of the dead zone to this limit.
+        `limit` is the magnitude of the limit towards which the flow moves, t/h. For a limit
+        inside the dead zone, the ratio is 0: every command is then at the edge of the dead
+        zone, beyond the limit, and the actuator applies the limit itself.
         """
         return np.maximum(limit - self._zone, 0.0) / np.where(limit > 0.0, limit, 1.0)
 
     def action(self, flow: Any) -> Any:
-        """Return the absolute action for a wanted flow in t/h, which is a float or an array.
+        """Return the action of the wrapped environment for a wanted flow, t/h.
 
-        The absolute action is the action of the wrapped environment that sets the flow. With
-        compensation, the command of this action skips the dead zone.
+        `flow` is a float or an array, and so is the result. With compensation, the action
+        commands a flow outside the dead zone unless the wanted flow is 0.
         """
         if not self._compensates:
             return action_from_command(flow, self.u_min, self.u_max)

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from mptc_gym.environments.layers import plant_groups
 from mptc_gym.plant.checks import many_actions, reject
-from mptc_gym.wrappers import NUMBERS, Actuator
+from mptc_gym.wrappers import ACTUATOR_NUMBERS, Actuator
 
 
 class IncrementalAction(VectorActionWrapper):
     """The action changes the flow: `mptc_gym.wrappers.IncrementalAction` for many plants.
 
-    The wrapper keeps a wanted flow, in t/h, for each plant. `reset` and `step` return what as
-    many single environments would return, each in `mptc_gym.wrappers.IncrementalAction`. All
-    three autoreset modes, and resets of some of the plants, work.
+    `reset` and `step` return the same as `mptc_gym.wrappers.IncrementalAction` around each
+    single environment. The wrapper supports all three autoreset modes, and resets of only some
+    plants.
 
     Parameters
     ----------
@@ -34,8 +34,8 @@ class IncrementalAction(VectorActionWrapper):
     Raises
     ------
     ValueError
-        If `env` is of another kind or an argument is out of range. Also raised by `step`, if
-        actions are not finite numbers of shape (num_envs, 1).
+        If `env` holds no `MiddlePointEnv` in NumPy, or if an argument is out of range. `step`
+        raises a ValueError if actions are not finite numbers of shape (num_envs, 1).
     """
 
     def __init__(
@@ -45,36 +45,40 @@ class IncrementalAction(VectorActionWrapper):
         max_move: float = 0.4,
         compensate_dead_zone: bool | float = False,
     ) -> None:
+        """Wrap a vector environment; the docstring of the class describes the arguments."""
         groups = plant_groups(env) if isinstance(env, VectorEnv) else []
         if not groups:
-            kind = "a vector environment of MiddlePointEnv in NumPy"
-            reject("env", env, f"{kind}; mptc_gym.wrappers takes one")
+            allowed = (
+                "a vector environment of MiddlePointEnv in NumPy; mptc_gym.wrappers takes one"
+            )
+            reject("env", env, allowed)
         super().__init__(env)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.increments = max_move, compensate_dead_zone
-        counts = [group.num_envs for group in groups]
+        # Dead zones and limits of all plants, t/h, shape (num_envs,) each; the lowest value of
+        # those that a reset draws anew.
         self._numbers = {}
-        for name in NUMBERS:
-            lowest = [group.parameters.range_of(name)[0] for group in groups]
-            self._numbers[name] = np.repeat(lowest, counts)
-        self._actuator = Actuator(self._numbers, *self.increments)
+        plants_per_group = [group.num_envs for group in groups]
+        for name in ACTUATOR_NUMBERS:
+            number_of_group = [group.parameters.range_of(name)[0] for group in groups]
+            self._numbers[name] = np.repeat(number_of_group, plants_per_group)
+        self._actuator = Actuator(self._numbers, max_move, compensate_dead_zone)
         self._mode = AutoresetMode(env.metadata["autoreset_mode"])
         self._flows = np.zeros(self.num_envs)  # wanted flows v, t/h
         # The plants whose episode has ended, and that the next step resets.
         self._ended = np.zeros(self.num_envs, np.bool_)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        """Reset all environments, or those of `reset_mask`, and their wanted flows to 0 t/h.
+        """Reset all environments, or those in `reset_mask`, and their wanted flows to 0 t/h.
 
-        `seed` and `options`, which may hold `reset_mask`, are those of the wrapped environment,
-        and so are the observations and infos that are returned.
+        `seed`, `options`, observations and infos are those of the wrapped environment.
         """
         # The mask is read before the reset, in which Gymnasium's vector environments remove the
         # mask from the options.
-        mask = options.get("reset_mask") if isinstance(options, Mapping) else None
-        if mask is None:
-            mask = np.ones(self.num_envs, np.bool_)
+        mask = np.ones(self.num_envs, np.bool_)
+        if isinstance(options, Mapping) and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])  # of an array or a tensor
         observations, infos = self.env.reset(seed=seed, options=options)
         self._begin_episodes(mask, infos)
         return observations, infos
@@ -86,28 +90,28 @@ class IncrementalAction(VectorActionWrapper):
         """
         moves = many_actions(actions, self.num_envs, self._ended)
         actuator = self._actuator
-        flows = self._flows + actuator.move * moves.clip(-1.0, 1.0)
+        flows = self._flows + actuator.flow_per_action * moves.clip(-1.0, 1.0)
         flows = flows.clip(actuator.u_min, actuator.u_max)
         absolute_actions = actuator.action(flows).astype(np.float32)[:, np.newaxis]
         returned = self.env.step(absolute_actions)
         _, _, terminations, truncations, infos = returned
         self._flows = flows
         ended = terminations | truncations
-        begins = ended if self._mode is AutoresetMode.SAME_STEP else self._ended.copy()
-        if begins.any():
-            self._begin_episodes(begins, infos)
+        reset_now = ended if self._mode is AutoresetMode.SAME_STEP else self._ended
+        if reset_now.any():
+            self._begin_episodes(reset_now, infos)
         if self._mode is AutoresetMode.NEXT_STEP:
             self._ended = ended
         return returned
 
-    def _begin_episodes(self, begins: NDArray[np.bool_], infos: dict[str, Any]) -> None:
-        """Set wanted flows to 0, and take the drawn limits and dead zones from infos.
+    def _begin_episodes(self, mask: NDArray[np.bool_], infos: dict[str, Any]) -> None:
+        """Set the wanted flows of the plants in `mask`, shape (num_envs,), to 0 t/h.
 
-        `begins` says of which plants an episode begins, shape (num_envs,). `infos` are the
-        infos at k = 0 of these plants.
+        If dead zones or limits are random, their new values are taken from the infos of the
+        reset.
         """
-        for name in {*NUMBERS} & {*infos}:
-            self._numbers[name][begins] = infos[name][begins]
+        for name in {*ACTUATOR_NUMBERS} & {*infos}:
+            self._numbers[name][mask] = infos[name][mask]
         self._actuator = Actuator(self._numbers, *self.increments)
-        self._flows[begins] = 0.0
-        self._ended = self._ended & ~begins
+        self._flows[mask] = 0.0
+        self._ended = self._ended & ~mask

@@ -1,0 +1,92 @@
+"""Store the observations of many plants in PyTorch."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from mptc_gym.torch_env.episodes import History, Restart
+
+
+class Window:
+    """The observations of n plants, computed ahead for a block of samples."""
+
+    def __init__(self, windows: Sequence[int], zeros: Tensor) -> None:
+        """Prepare observations of n plants.
+
+        Parameters
+        ----------
+        windows
+            How many set points, errors, outputs and past actions an observation holds.
+        zeros
+            Zeros of the device and type to use, shape (n,).
+        """
+        *self._windows, self._past_actions = windows
+        self._zeros = zeros
+        # The histories of set points, errors and outputs, degC.
+        self._histories = [History(zeros, window) for window in self._windows]
+        self._actions = zeros.expand(self._past_actions, -1)  # past actions, the newest first
+        # Observations of the rest of the block, without past actions, shape (size, n), the next
+        # sample last.
+        self._ahead: list[Tensor] = []
+
+    def reset(self, restart: Restart, setpoint: Tensor, rest_action: Tensor) -> None:
+        """Set the observations of the plants in `restart.mask` to those of a plant at rest.
+
+        `setpoint` are set points y_d(0), degC, and `rest_action` the actions for a flow of 0
+        t/h, both of shape (n,).
+        """
+        setpoints, errors, outputs = self._histories
+        setpoints.reset(restart, newest=setpoint)
+        errors.reset(restart, newest=setpoint)
+        outputs.reset(restart)
+        self._actions = torch.where(restart.mask, rest_action.clamp(-1.0, 1.0), self._actions)
+
+    def extend(self, *blocks: Tensor) -> None:
+        """Add a block of set points, errors and outputs, in this order.
+
+        Each tensor in `blocks` has the shape (samples, n), degC.
+        """
+        for history, window, block in zip(self._histories, self._windows, blocks, strict=True):
+            if window:
+                history.extend(block.unbind())
+        samples = len(blocks[0])
+        self._ahead = self._stack(samples, first_place=1)[::-1]
+
+    def next(self, actions: Tensor) -> Tensor:
+        """Return the observations of the next sample of the block, shape (n, size).
+
+        `actions`, shape (n,), are the actions that led to this sample.
+        """
+        observations = self._ahead.pop()
+        if self._past_actions:
+            newest = actions.clamp(-1.0, 1.0)[None]
+            self._actions = torch.cat((newest, self._actions))[:-1]
+            observations = torch.cat((observations, self._actions))
+        return observations.t()
+
+    def present(self) -> Tensor:
+        """Return the observations after a reset, shape (n, size)."""
+        return torch.cat((*self._stack(1, first_place=0), self._actions)).t()
+
+    def detach(self) -> None:
+        """Cut the gradient graph from stored observations to earlier actions."""
+        for history in self._histories:
+            history.detach()
+        self._ahead = [observations.detach() for observations in self._ahead]
+        self._actions = self._actions.detach()
+
+    def _stack(self, samples: int, first_place: int) -> list[Tensor]:
+        """Return the observations of consecutive samples, in tensors of shape (size, n).
+
+        Past actions are left out. The first of the `samples` observations begins at index
+        `first_place` of the histories.
+        """
+        newest_first: list[Tensor] = []  # the elements of all observations, shape (n,) each
+        for place in range(first_place, first_place + samples):
+            for history, window in zip(self._histories, self._windows, strict=True):
+                newest_first += history.rows[place : place + window][::-1]
+        n = len(self._zeros)
+        if not newest_first:  # the observation holds past actions alone
+            return [self._zeros.new_empty(0, n)] * samples
+        return [*torch.stack(newest_first).view(samples, -1, n).unbind()]
