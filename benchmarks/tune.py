@@ -172,8 +172,8 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        A row for each finalist: the numbers that `score` returns, and the objective of the
-        trial "in the search", degC.
+        A row for each finalist: the numbers that `score` returns, and "in the search", the
+        objective of the trial with these gains, degC.
     """
     import pandas as pd
 
@@ -187,11 +187,12 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
-    """Score the gains of `FIXED_GAINS` on new runs, and return a table of texts.
+    """Score the gains that other commands use on new runs, and return a table of texts.
 
-    A row has the label of a controller, the origin of its gains, the gains, and the objective,
-    degC. `name` is the name of the controller whose gains were searched, and `plant` has the
-    arguments of the environment for the plant of the search.
+    The controllers with these gains are in `FIXED_GAINS`. A row has the label of a controller,
+    the origin of its gains, the gains, and the objective, degC. `name` is the name of the
+    controller whose gains were searched, and `plant` has the arguments of the environment for
+    the plant of the search.
     """
     import pandas as pd
 
@@ -257,7 +258,7 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     scaled_cases: dict[str, TuningCase] = {}
     for name, case in CASES.items():
         scaled = {key: factors[key] * value for key, value in case.arguments.items()}
-        if "setpoint_period" in scaled:  # must be even
+        if "setpoint_period" in scaled:  # The period must be an even number of samples.
             scaled["setpoint_period"] = max(2, 2 * round(scaled["setpoint_period"] / 2))
         if "dead_zone" in scaled:
             scaled["dead_zone"] = min(scaled["dead_zone"], widest_zone)

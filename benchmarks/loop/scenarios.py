@@ -176,8 +176,9 @@ class PlantOptions:
             arguments |= PRESETS[self.preset]
         if self.plant:
             try:
-                arguments |= dict(**json.loads(self.plant.read_text(encoding="utf-8")))
-            except (OSError, TypeError, ValueError) as error:  # no file, no object, no JSON
+                content = json.loads(self.plant.read_text(encoding="utf-8"))
+                arguments |= dict(**content)  # a TypeError if `content` is no mapping
+            except (OSError, TypeError, ValueError) as error:
                 allowed = 'a JSON file of arguments, such as {"delay": 20}'
                 raise UsageError(f"--plant: {self.plant} must be {allowed}: {error}") from error
         for text in self.set:
@@ -237,7 +238,7 @@ def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
     rows = (low + shares * (high - low)).round(4).tolist()
     plants: list[Arguments] = []
     for i, row in enumerate(rows):
-        plant = dict(zip(SPANS, row, strict=False))
+        plant = dict(zip(SPANS, row, strict=False))  # without the factors after a drift
         plant["delay"] = round(plant["delay"])
         if i >= count // 2:
             final_factors = row[len(SPANS) :]
