@@ -353,20 +353,11 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Arguments) -> None:
-    """Draw the map of errors, write the report and print it.
+    """Draw the map of errors, write the report to the folder `out`, and print the report.
 
     If plants drift, the report has a table for each of `QUESTIONS` whose controllers have run.
-
-    Parameters
-    ----------
-    runs
-        The table of runs that the function `table` returns.
-    out
-        Folder of the report.
-    nominal
-        The nominal plant.
-    provenance
-        Command, commit and versions, for the report.
+    `runs` is the table that the function `table` returns. `provenance` has the command, the
+    commit and the versions.
     """
     from benchmarks.lib.report import Section, write_report
     from benchmarks.plots.sweep import draw

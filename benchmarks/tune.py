@@ -158,22 +158,10 @@ def work(options: Options) -> str:
 def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
     """Score the best trials of a search on new runs, and return a row for each, best first.
 
-    The best gains of a search owe some of their result to luck, and new runs show how much.
-
-    Parameters
-    ----------
-    name
-        Name of the controller.
-    plant
-        Arguments of the environment for the plant of the search.
-    trials
-        The trials of the search, as `search` returns them.
-
-    Returns
-    -------
-    DataFrame
-        A row for each finalist: the numbers that `score` returns, and "in the search", the
-        objective of the trial with these gains, degC.
+    The best gains of a search owe some of their result to luck, and new runs show how much. A
+    row has the numbers that `score` returns, and "in the search", the objective of the trial,
+    degC. `trials` is the table that `search` returns, and `plant` has the arguments of the
+    environment.
     """
     import pandas as pd
 
@@ -191,8 +179,7 @@ def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
 
     The controllers with these gains are in `FIXED_GAINS`. A row has the label of a controller,
     the origin of its gains, the gains, and the objective, degC. `name` is the name of the
-    controller whose gains were searched, and `plant` has the arguments of the environment for
-    the plant of the search.
+    controller whose gains were searched, and `plant` has the arguments of the environment.
     """
     import pandas as pd
 
@@ -211,19 +198,8 @@ def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
     """Return the interval of the search for each gain of a controller, by the gain's name.
 
     An interval is a pair: the value with the smallest magnitude, and the value with the largest
-    magnitude, both of the same sign.
-
-    Parameters
-    ----------
-    name
-        Name of the controller.
-    plant
-        Arguments of the environment for the plant.
-
-    Raises
-    ------
-    UsageError
-        If the plant has no gain or time constant that defines the intervals.
+    magnitude, both of the same sign. A `UsageError` is raised if the plant has no gain or time
+    constant that defines the intervals. `plant` has the arguments of the environment.
     """
     with blame("--plant"):
         return SPANS[name](Parameters(**plant))
@@ -280,8 +256,8 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     """Try sets of gains of a controller, and return a table with a row for each trial.
 
     A row has the numbers that `score` returns. After an interruption, the rows of the finished
-    trials are in `trials.csv`. A search that starts again tries the same gains as before, and
-    loads the results of finished trials from the folder.
+    trials are in the file `trials.csv` in `folder`. A search that starts again tries the same
+    gains as before, and loads the results of finished trials from `folder`.
 
     Parameters
     ----------
@@ -294,7 +270,7 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     runs
         Runs of each case in a trial.
     folder
-        Folder of `trials.csv` and of the results of single trials.
+        Folder that `results_folder` yields.
     """
     import optuna
     import pandas as pd

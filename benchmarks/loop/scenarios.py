@@ -215,19 +215,11 @@ DRIFTS = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_dr
 
 
 def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
-    """Return random plants: for each plant, the values of its arguments, drawn from `SPANS`.
+    """Return `count` random plants: for each, the values of its arguments, drawn from `SPANS`.
 
-    The values form a Latin hypercube. The second half of the plants drift: the factors of gain
-    and time constant change, over `samples` samples, to other values within `SPANS`.
-
-    Parameters
-    ----------
-    count
-        Number of plants.
-    seed
-        Seed of the Latin hypercube.
-    samples
-        Duration of the drifts, in samples.
+    The values form a Latin hypercube with the seed `seed`. The second half of the plants drift:
+    the factors of gain and time constant change, over `samples` samples, to other values within
+    `SPANS`.
     """
     from scipy.stats.qmc import LatinHypercube  # here: slow to import
 
@@ -257,12 +249,8 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
     scaled in the same way. The noise variance is scaled with the square of the temperature
     change that the flow can cause. All other arguments keep their values.
 
-    Parameters
-    ----------
-    nominal_plant
-        The environment's arguments for the other plant.
-    variations
-        For each variation, the arguments that differ from the paper's plant.
+    `nominal_plant` has the environment's arguments for the other plant. A variation has the
+    arguments that differ from the nominal plant.
     """
     scales = _scales(Parameters(**nominal_plant))
     paper_scales = _scales(Parameters())
