@@ -507,11 +507,13 @@ def explained_share(fit: Fit) -> float:
 def polynomials(fit: Fit, delay: int) -> tuple[Array, Array, Array, float]:
     """Return the polynomials A, B, C of equation (28) of the paper, and the variance of xi.
 
-    The variance of the white noise xi is in degC^2. A and C have their coefficients from z^0 on, and B from z^-1 on, degC per t/h. With a delay
-    of `delay` samples, A and B reproduce the flow response of the fit exactly if the delay of
-    the fit is at least `delay` samples and at most one sample longer. If the delay of the fit
-    is shorter, B leaves out the response before the sample `delay + 1`. C and xi give noise
-    that resembles the noise of the log.
+    A and C have their coefficients from z^0 on. B has its coefficients from z^-1 on, in degC
+    per t/h. The variance of the white noise xi is in degC^2.
+
+    With a delay of `delay` samples, A and B reproduce the flow response of the fit exactly if
+    the delay of the fit is at least `delay` samples and at most one sample longer. If the delay
+    of the fit is shorter, B leaves out the response before the sample `delay + 1`. C and xi
+    give noise that resembles the noise of the log.
     """
     unknowns = fit.unknowns
     lags = np.array([unknowns.slow, unknowns.fast])
