@@ -406,6 +406,7 @@ def with_zone(fit: Fit) -> Fit:
     most_without_zone = table.improvement[table.half_width == 0.0].max()
     if most - most_without_zone < IMPROVEMENT_BY_DEAD_ZONE:
         return replace(fit, zone=DeadZone(table.centre.mean()))
+    # Dead zones with nearly the largest improvement are about as likely as the best one.
     likeliest = table[table.improvement > most - 2.0]
     return replace(fit, zone=DeadZone(likeliest.centre.mean(), likeliest.half_width.mean()))
 
