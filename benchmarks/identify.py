@@ -321,8 +321,8 @@ def is_white(errors: NDArray[np.float64]) -> bool:
     to 30 blocks, are larger than chance explains.
     """
     correlations = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
-    # By chance, few correlations are larger than 2.5 / sqrt(n), where n is the number of blocks.
-    # Correlations up to 0.1 do no harm, even if they are not due to chance.
+    # By chance, few correlations of n blocks are larger than 2.5 / sqrt(n). Correlations up to
+    # 0.1 do no harm, even if they are not due to chance.
     is_large = np.abs(correlations) > max(0.1, 2.5 / np.sqrt(len(errors)))
     return bool(np.mean(is_large) <= 0.25)
 

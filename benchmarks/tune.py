@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 SEED = SEEDS["sampler"].first  # seed of Optuna's sampler in the first trial
 STARTUP = 200  # number of trials with random gains, before the sampler learns from trials
 FIRST_RUN = SEEDS["preparation"].first  # seed of the first run of every trial
-SPACING = 100_000  # from the first seed of a case to the first seed of the next case
+SEED_SPACING = 100_000  # from the first seed of a case to the first seed of the next case
 FINALISTS = 10  # number of best trials that are judged again on new runs
 FINAL_RUNS = 1000  # runs of each case, to judge gains on new runs
 FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first of these runs
@@ -312,7 +312,12 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
 def score(
     name: str, plant: Arguments, runs: int, first_run: int, gains: Mapping[str, float]
 ) -> dict[str, float]:
-    """Run a controller with some gains in all cases, and return a dict of numbers.
+    """Run a controller with some gains in all cases, and return numbers by name.
+
+    The numbers are the gains; the median over runs of the mean error in each case, degC, by the
+    name of the case; "not converged", the share of runs that do not settle at the constant set
+    point; and "objective", degC, which the search minimises: the mean of the medians, plus a
+    penalty that is proportional to "not converged".
 
     Parameters
     ----------
@@ -326,20 +331,12 @@ def score(
         Seed of the first run of the first case.
     gains
         The gains by name.
-
-    Returns
-    -------
-    dict
-        The gains by name; the median over runs of the mean error in each case, degC, by the
-        name of the case; "not converged", the share of runs that do not settle at the constant
-        set point; and "objective", degC, which the search minimises: the mean of the medians,
-        plus a penalty that is proportional to "not converged".
     """
     controller = ROSTER[name].with_gains(gains)
     medians: dict[str, float] = {}
     unsettled = 0.0
     for i, (case_name, case) in enumerate(cases(plant).items()):
-        seed = first_run + i * SPACING
+        seed = first_run + i * SEED_SPACING
         trajectory = controller.run(case.arguments, case.samples, runs, seed)
         medians[case_name] = float(np.median(mean_error(trajectory[case.first :])))
         if case_name == "constant":

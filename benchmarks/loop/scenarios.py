@@ -175,12 +175,7 @@ class PlantOptions:
         if self.preset:
             arguments |= PRESETS[self.preset]
         if self.plant:
-            try:
-                content = json.loads(self.plant.read_text(encoding="utf-8"))
-                arguments |= dict(**content)  # a TypeError if `content` is no mapping
-            except (OSError, TypeError, ValueError) as error:
-                allowed = 'a JSON file of arguments, such as {"delay": 20}'
-                raise UsageError(f"--plant: {self.plant} must be {allowed}: {error}") from error
+            arguments |= _read_plant(self.plant)
         for text in self.set:
             name, equals, value = text.partition("=")
             if not (name and equals):
@@ -199,6 +194,16 @@ class PlantOptions:
         except (TypeError, ValueError) as error:  # A TypeError names an unknown argument.
             raise UsageError(f"{', '.join(options)}: {error}") from error
         return arguments
+
+
+def _read_plant(file: Path) -> Arguments:
+    """Return the arguments of the environment in a JSON file, the value of `--plant`."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        return dict(**content)  # a TypeError if `content` is no mapping
+    except (OSError, TypeError, ValueError) as error:
+        allowed = 'a JSON file of arguments, such as {"delay": 20}'
+        raise UsageError(f"--plant: {file} must be {allowed}: {error}") from error
 
 
 # Ranges of the random plants that `random_design` returns, by argument of the environment. With
