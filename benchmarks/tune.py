@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 SEED = SEEDS["sampler"].first  # seed of Optuna's sampler in the first trial
 STARTUP = 200  # number of trials with random gains, before the sampler learns from trials
 FIRST_RUN = SEEDS["preparation"].first  # seed of the first run of every trial
-SEED_SPACING = 100_000  # from the first seed of a case to the first seed of the next case
+SPACING_OF_CASES = 100_000  # between the first seeds of two successive cases
 FINALISTS = 10  # number of best trials that are judged again on new runs
 FINAL_RUNS = 1000  # runs of each case, to judge gains on new runs
 FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first of these runs
@@ -336,7 +336,7 @@ def score(
     medians: dict[str, float] = {}
     unsettled = 0.0
     for i, (case_name, case) in enumerate(cases(plant).items()):
-        seed = first_run + i * SEED_SPACING
+        seed = first_run + i * SPACING_OF_CASES
         trajectory = controller.run(case.arguments, case.samples, runs, seed)
         medians[case_name] = float(np.median(mean_error(trajectory[case.first :])))
         if case_name == "constant":
