@@ -308,7 +308,7 @@ def table(
     agents
         The names of the controllers.
     results
-        The results of the tasks that have finished, by the names of `tasks_of`.
+        The results of the tasks that have finished, by the names that `tasks_of` returns.
     """
     import pandas as pd
 

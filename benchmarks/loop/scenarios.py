@@ -271,11 +271,11 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
 
 
 def _scales(plant: Parameters) -> dict[str, float]:
-    """Return the quantity of a plant to which `around` scales each argument in `SPANS`.
+    """Return a plant's value of each argument in `SPANS`, with which `around` scales.
 
-    For the noise variance, the quantity is the square of the temperature change by half the
-    range of the flow, degC^2. For any other argument, the quantity is the value of the argument
-    in the nominal plant, which is the plant in the middle of all ranges.
+    If an argument of the plant has a range, the value is the middle of the range. In place of
+    the noise variance, which may be 0, the result has the square of the temperature change by
+    half the range of the flow, degC^2.
     """
     model = nominal(plant)
     reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0  # degC
