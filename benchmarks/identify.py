@@ -321,6 +321,8 @@ def is_white(errors: NDArray[np.float64]) -> bool:
     to 30 blocks, are larger than chance explains.
     """
     correlations = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
+    # By chance, few correlations of n blocks are larger than 2.5 / sqrt(n). Correlations up to
+    # 0.1 do no harm, even if they are not due to chance.
     is_large = np.abs(correlations) > max(0.1, 2.5 / np.sqrt(len(errors)))
     return bool(np.mean(is_large) <= 0.25)
 
@@ -362,7 +364,7 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
     u_min = float(flow.min()) if options.u_min is None else options.u_min
     u_max = float(flow.max()) if options.u_max is None else options.u_max
     smaller_limit, larger_limit = sorted([-u_min, u_max])
-    # The set point has both signs, so that the flow must move to both sides.
+    # The set point has both signs, so the flow must move to both sides, if it can.
     usable_limit = larger_limit if is_one_sided(u_min, u_max) else smaller_limit
     gain = abs(fit.unknowns.gain)
     settling = delay + round(4.0 * (fit.unknowns.slow + fit.unknowns.fast))  # samples

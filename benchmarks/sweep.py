@@ -33,9 +33,9 @@ SAMPLES = 1200  # length of a run
 SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
 SEED = SEEDS["studies"].first  # seed of the first run on each plant, and of the bootstraps
 PLANTS = 200  # default number of plants in a random design
-# A run oscillates if the standard deviation of its error on steady stretches exceeds that of an
-# idle valve by this number, degC.
-OSCILLATES = 1.0
+# A run oscillates if the standard deviation of its error on steady stretches exceeds the
+# standard deviation with an idle valve by this number, degC.
+OSCILLATION_THRESHOLD = 1.0
 # Headings and number formats of the report's table, by the names of columns of `summarise`.
 COLUMNS = {
     "multiple": ("error ratio (median)", "{:.3f}"),
@@ -53,8 +53,9 @@ FAILURES = (
     "The valve travel is the sum of all changes of the flow in a run, and the table gives the "
     "median over all runs. A steady stretch is the second half of the time between two changes "
     "of the set point. A run oscillates if the standard deviation of its error on steady "
-    f"stretches is more than {OSCILLATES:g} °C larger than with an idle valve. A run is no "
-    "better than an idle valve if its mean error is at least as large as with an idle valve."
+    f"stretches is more than {OSCILLATION_THRESHOLD:g} °C larger than with an idle valve. A "
+    "run is no better than an idle valve if its mean error is at least as large as with an "
+    "idle valve."
 )
 PICTURE = "The error of each controller on each plant, relative to the least possible error"
 # Groups of plants in a random design: a name, and a condition on the plants' arguments for
@@ -176,10 +177,11 @@ def tasks_of(
     nominal: Arguments,
     plants: Sequence[Arguments],
 ) -> dict[str, Any]:
-    """Return the runs of the sweep as functions without arguments, by name.
+    """Return a function without arguments for each controller on each plant, by name.
 
-    The name is "plant 0" for the idle valve on the first plant, and "plant 0, nn" for the
-    controller `nn` on the first plant.
+    A function runs the controller on the plant, and returns the result of `run_agent`, or of
+    `run_idle_valve` for an idle valve. The name is "plant 0" for the idle valve on the first
+    plant, and "plant 0, nn" for the controller `nn` on the first plant.
 
     Parameters
     ----------
@@ -206,6 +208,7 @@ def tasks_of(
             prior = case
             if options.told == "nominal":
                 prior = {**nominal, **SETPOINT}
+                # A self-tuning controller knows between which plants it has to adapt.
                 if "delay_range" in member.prior_knowledge:
                     prior |= ranges
             tasks[f"plant {i}, {name}"] = partial(run_agent, member, prior, case, options.runs)
@@ -273,14 +276,14 @@ def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
     """Return the standard deviation of the error on steady stretches, degC, shape (runs,).
 
-    Between two changes of the set point, the second half of the samples is a steady stretch.
-    The variance of the error is averaged over all steady stretches of a run.
+    A steady stretch is the second half of the samples between two changes of the set point. The
+    variance of the error is averaged over all steady stretches of a run.
     """
     errors = trajectory.setpoint - trajectory.output
-    variances = [
-        errors[(start + stop) // 2 : stop].var(axis=0)
-        for start, stop in held(trajectory.setpoint[:, 0])
-    ]
+    variances = []
+    for start, stop in held(trajectory.setpoint[:, 0]):
+        steady = errors[(start + stop) // 2 : stop]
+        variances.append(steady.var(axis=0))
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))
 
 
@@ -289,10 +292,14 @@ def table(
 ) -> pd.DataFrame:
     """Return a table with a row for each run that has finished.
 
-    The columns are `plant` (the number of the plant), `agent` (the name of the controller), the
-    measures of `run_agent`, `limit` (the least possible error, degC), `ratio` (the mean error
-    divided by `limit`), `oscillates` (whether the run oscillates), `useless` (whether the run
-    is no better than an idle valve in the same noise), and the arguments of the plant.
+    The columns are the measures of `run_agent`, the arguments of the plant, and:
+
+    - `plant`: the number of the plant;
+    - `agent`: the name of the controller;
+    - `limit`: the least possible mean error on the plant, degC;
+    - `ratio`: the error ratio, which is the mean error divided by `limit`;
+    - `oscillates`: whether the run oscillates;
+    - `useless`: whether the run is no better than an idle valve in the same noise.
 
     Parameters
     ----------
@@ -301,7 +308,7 @@ def table(
     agents
         The names of the controllers.
     results
-        The results of the tasks that have finished, by the names of `tasks_of`.
+        The results of the tasks that have finished, by the names that `tasks_of` returns.
     """
     import pandas as pd
 
@@ -314,7 +321,7 @@ def table(
                 comparisons = {
                     "limit": idle["least_possible"],
                     "ratio": measures["mae"] / idle["least_possible"],
-                    "oscillates": measures["swing"] > idle["swing"] + OSCILLATES,
+                    "oscillates": measures["swing"] > idle["swing"] + OSCILLATION_THRESHOLD,
                     "useless": measures["mae"] >= idle["mae"],
                 }
                 columns = {"plant": i, "agent": agent, **measures, **comparisons, **plant}
@@ -325,10 +332,15 @@ def table(
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a table with a row for each controller.
 
-    The columns are `agent` (the name of the controller), `multiple` and `multiple_p90` (the
-    median and the 90th percentile over the plants of the median error ratio on a plant),
-    `travel` (the median valve travel of the runs, t/h), and `oscillates` and `useless` (shares
-    of the runs, %). `runs` is the table that the function `table` returns.
+    The columns are:
+
+    - `agent`: the name of the controller;
+    - `multiple` and `multiple_p90`: the median and the 90th percentile over the plants, where
+      the value of a plant is the median of `ratio` over the runs on the plant;
+    - `travel`: the median valve travel of the runs, t/h;
+    - `oscillates` and `useless`: the shares of the runs for which these columns are true, %.
+
+    `runs` is the table that the function `table` returns.
     """
     by_agent = runs.groupby("agent", sort=False)
     ratios_of_plants = runs.groupby(["agent", "plant"], sort=False)["ratio"].median()
@@ -341,20 +353,11 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Arguments) -> None:
-    """Draw the map of errors, write the report and print it.
+    """Draw the map of errors, write the report to the folder `out`, and print the report.
 
     If plants drift, the report has a table for each of `QUESTIONS` whose controllers have run.
-
-    Parameters
-    ----------
-    runs
-        The table of runs that `table` returns.
-    out
-        Folder of the report.
-    nominal
-        The nominal plant.
-    provenance
-        Command, commit and versions, for the report.
+    `runs` is the table that the function `table` returns. `provenance` has the command, the
+    commit and the versions.
     """
     from benchmarks.lib.report import Section, write_report
     from benchmarks.plots.sweep import draw

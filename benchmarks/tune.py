@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 SEED = SEEDS["sampler"].first  # seed of Optuna's sampler in the first trial
 STARTUP = 200  # number of trials with random gains, before the sampler learns from trials
 FIRST_RUN = SEEDS["preparation"].first  # seed of the first run of every trial
-SPACING = 100_000  # from the first seed of a case to the first seed of the next case
+SPACING_OF_CASES = 100_000  # between the first seeds of two successive cases
 FINALISTS = 10  # number of best trials that are judged again on new runs
 FINAL_RUNS = 1000  # runs of each case, to judge gains on new runs
 FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first of these runs
@@ -158,22 +158,10 @@ def work(options: Options) -> str:
 def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
     """Score the best trials of a search on new runs, and return a row for each, best first.
 
-    The best gains of a search owe some of their result to luck, and new runs show how much.
-
-    Parameters
-    ----------
-    name
-        Name of the controller.
-    plant
-        Arguments of the environment for the plant of the search.
-    trials
-        The trials of the search, as `search` returns them.
-
-    Returns
-    -------
-    DataFrame
-        A row for each finalist: the numbers that `score` returns, and the objective of the
-        trial "in the search", degC.
+    The best gains of a search owe some of their result to luck, and new runs show how much. A
+    row has the numbers that `score` returns, and "in the search", the objective of the trial,
+    degC. `trials` is the table that `search` returns, and `plant` has the arguments of the
+    environment.
     """
     import pandas as pd
 
@@ -187,11 +175,11 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
-    """Score the gains of `FIXED_GAINS` on new runs, and return a table of texts.
+    """Score the gains that other commands use on new runs, and return a table of texts.
 
-    A row has the label of a controller, the origin of its gains, the gains, and the objective,
-    degC. `name` is the name of the controller whose gains were searched, and `plant` has the
-    arguments of the environment for the plant of the search.
+    The controllers with these gains are in `FIXED_GAINS`. A row has the label of a controller,
+    the origin of its gains, the gains, and the objective, degC. `name` is the name of the
+    controller whose gains were searched, and `plant` has the arguments of the environment.
     """
     import pandas as pd
 
@@ -210,19 +198,8 @@ def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
     """Return the interval of the search for each gain of a controller, by the gain's name.
 
     An interval is a pair: the value with the smallest magnitude, and the value with the largest
-    magnitude, both of the same sign.
-
-    Parameters
-    ----------
-    name
-        Name of the controller.
-    plant
-        Arguments of the environment for the plant.
-
-    Raises
-    ------
-    UsageError
-        If the plant has no gain or time constant that defines the intervals.
+    magnitude, both of the same sign. A `UsageError` is raised if the plant has no gain or time
+    constant that defines the intervals. `plant` has the arguments of the environment.
     """
     with blame("--plant"):
         return SPANS[name](Parameters(**plant))
@@ -257,7 +234,7 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     scaled_cases: dict[str, TuningCase] = {}
     for name, case in CASES.items():
         scaled = {key: factors[key] * value for key, value in case.arguments.items()}
-        if "setpoint_period" in scaled:  # must be even
+        if "setpoint_period" in scaled:  # The period must be an even number of samples.
             scaled["setpoint_period"] = max(2, 2 * round(scaled["setpoint_period"] / 2))
         if "dead_zone" in scaled:
             scaled["dead_zone"] = min(scaled["dead_zone"], widest_zone)
@@ -279,8 +256,8 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     """Try sets of gains of a controller, and return a table with a row for each trial.
 
     A row has the numbers that `score` returns. After an interruption, the rows of the finished
-    trials are in `trials.csv`. A search that starts again tries the same gains as before, and
-    loads the results of finished trials from the folder.
+    trials are in the file `trials.csv` in `folder`. A search that starts again tries the same
+    gains as before, and loads the results of finished trials from `folder`.
 
     Parameters
     ----------
@@ -293,7 +270,7 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     runs
         Runs of each case in a trial.
     folder
-        Folder of `trials.csv` and of the results of single trials.
+        Folder that `results_folder` yields.
     """
     import optuna
     import pandas as pd
@@ -335,7 +312,12 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
 def score(
     name: str, plant: Arguments, runs: int, first_run: int, gains: Mapping[str, float]
 ) -> dict[str, float]:
-    """Run a controller with some gains in all cases, and return a dict of numbers.
+    """Run a controller with some gains in all cases, and return numbers by name.
+
+    The numbers are the gains; the median over runs of the mean error in each case, degC, by the
+    name of the case; "not converged", the share of runs that do not settle at the constant set
+    point; and "objective", degC, which the search minimises: the mean of the medians, plus a
+    penalty that is proportional to "not converged".
 
     Parameters
     ----------
@@ -349,20 +331,12 @@ def score(
         Seed of the first run of the first case.
     gains
         The gains by name.
-
-    Returns
-    -------
-    dict
-        The gains by name; the median over runs of the mean error in each case, degC, by the
-        name of the case; "not converged", the share of runs that do not settle at the constant
-        set point; and "objective", degC, which the search minimises: the mean of the medians,
-        plus a penalty that is proportional to "not converged".
     """
     controller = ROSTER[name].with_gains(gains)
     medians: dict[str, float] = {}
     unsettled = 0.0
     for i, (case_name, case) in enumerate(cases(plant).items()):
-        seed = first_run + i * SPACING
+        seed = first_run + i * SPACING_OF_CASES
         trajectory = controller.run(case.arguments, case.samples, runs, seed)
         medians[case_name] = float(np.median(mean_error(trajectory[case.first :])))
         if case_name == "constant":

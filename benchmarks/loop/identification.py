@@ -275,19 +275,9 @@ class Fit:
     def try_candidates(self, target: Array, candidates: Array) -> tuple[Array, Array]:
         """Fit the background and a multiple of one candidate to a signal, for each candidate.
 
-        Parameters
-        ----------
-        target : array of shape (rows,)
-            The signal that is fitted, degC.
-        candidates : array of shape (rows, candidates)
-            The signals that are tried as an additional term of the model, in any unit.
-
-        Returns
-        -------
-        squares : array of shape (candidates,)
-            The sum of the squared prediction errors with each candidate, degC^2.
-        factors : array of shape (candidates,)
-            The factor of each candidate, degC per unit of the candidate.
+        `target` is the signal, degC, shape (rows,). `candidates` are signals in any unit, shape
+        (rows, candidates). The results are the sums of the squared prediction errors, degC^2,
+        and the factors of the candidates, degC per unit, both of shape (candidates,).
         """
         # Regress the target and the candidates on the background. What the background does not
         # explain of the target is then fitted by what it does not explain of a candidate.
@@ -344,15 +334,9 @@ def possible_zones(
 ) -> list[DeadZone]:
     """Return the dead zones that the valve of a log may have, those of half width 0 first.
 
-    Parameters
-    ----------
-    flow
-        The flow of the log, t/h, shape (rows,).
-    operating_flow
-        The centre of the dead zone, t/h; None if the centre is unknown. For an unknown centre,
-        the result has centres in the whole range of the flow.
-    applied
-        Whether the flow was measured behind the valve, so that all half widths are 0.
+    `flow` is the flow of the log, t/h, shape (rows,). `operating_flow` is the centre of the
+    dead zone, t/h; if it is None, the result has centres in the whole range of the flow. If
+    `applied` is true, the flow was measured behind the valve, and all half widths are 0.
     """
     centres = np.linspace(flow.min(), flow.max(), GRID_POINTS)
     if operating_flow is not None:
@@ -422,6 +406,7 @@ def with_zone(fit: Fit) -> Fit:
     most_without_zone = table.improvement[table.half_width == 0.0].max()
     if most - most_without_zone < IMPROVEMENT_BY_DEAD_ZONE:
         return replace(fit, zone=DeadZone(table.centre.mean()))
+    # Dead zones with nearly the largest improvement are about as likely as the best one.
     likeliest = table[table.improvement > most - 2.0]
     return replace(fit, zone=DeadZone(likeliest.centre.mean(), likeliest.half_width.mean()))
 
@@ -464,14 +449,9 @@ def with_load_steps(fit: Fit) -> Fit:
 def identify(log: Log, zones: list[DeadZone], end_row: int | None = None) -> Fit:
     """Identify the plant of a log: return the best fit of the model to the log.
 
-    Parameters
-    ----------
-    log : Log
-        The log. The plant need not be at rest in the first row.
-    zones : list of DeadZone
-        The dead zones to choose from, as `possible_zones` returns them.
-    end_row : int, optional
-        The model is fitted to the rows before this one; by default, to all rows.
+    The plant need not be at rest in the first row. `zones` are the dead zones to choose from,
+    as `possible_zones` returns them. The model is fitted to the rows before `end_row`, or to
+    all rows if `end_row` is None.
     """
     fit = first_fit(log, zones, end_row)
     for _ in range(2):  # because the best dead zone depends on the lags and vice versa
@@ -526,23 +506,15 @@ def explained_share(fit: Fit) -> float:
 
 
 def polynomials(fit: Fit, delay: int) -> tuple[Array, Array, Array, float]:
-    """Convert a fit to the form of equation (28) of the paper, with a delay in whole samples.
+    """Return the polynomials A, B, C of equation (28) of the paper, and the variance of xi.
 
-    A and B of equation (28) reproduce the flow response of the fit exactly if the delay of the
-    fit is at least `delay` samples and at most one sample longer. If the delay of the fit is
-    shorter, B leaves out the response before the sample `delay + 1`. C and the variance of the
-    white noise xi of equation (28) give noise that resembles the noise of the log.
+    A and C have their coefficients from z^0 on. B has its coefficients from z^-1 on, in degC
+    per t/h. The variance of the white noise xi is in degC^2.
 
-    Returns
-    -------
-    a : Array
-        The coefficients of the polynomial A, from z^0 on.
-    b : Array
-        The coefficients of the polynomial B, from z^-1 on, degC per t/h.
-    c : Array
-        The coefficients of the polynomial C, from z^0 on.
-    variance : float
-        The variance of the white noise xi, degC^2.
+    With a delay of `delay` samples, A and B reproduce the flow response of the fit exactly if
+    the delay of the fit is at least `delay` samples and at most one sample longer. If the delay
+    of the fit is shorter, B leaves out the response before the sample `delay + 1`. C and xi
+    give noise that resembles the noise of the log.
     """
     unknowns = fit.unknowns
     lags = np.array([unknowns.slow, unknowns.fast])

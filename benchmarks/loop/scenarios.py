@@ -175,11 +175,7 @@ class PlantOptions:
         if self.preset:
             arguments |= PRESETS[self.preset]
         if self.plant:
-            try:
-                arguments |= dict(**json.loads(self.plant.read_text(encoding="utf-8")))
-            except (OSError, TypeError, ValueError) as error:  # no file, no object, no JSON
-                allowed = 'a JSON file of arguments, such as {"delay": 20}'
-                raise UsageError(f"--plant: {self.plant} must be {allowed}: {error}") from error
+            arguments |= _read_plant(self.plant)
         for text in self.set:
             name, equals, value = text.partition("=")
             if not (name and equals):
@@ -200,6 +196,16 @@ class PlantOptions:
         return arguments
 
 
+def _read_plant(file: Path) -> Arguments:
+    """Return the arguments of the environment in a JSON file, the value of `--plant`."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        return dict(**content)  # a TypeError if `content` is no mapping
+    except (OSError, TypeError, ValueError) as error:
+        allowed = 'a JSON file of arguments, such as {"delay": 20}'
+        raise UsageError(f"--plant: {file} must be {allowed}: {error}") from error
+
+
 # Ranges of the random plants that `random_design` returns, by argument of the environment. With
 # a gain factor below 0.74, the largest flow could not keep the temperature at 5 degC.
 SPANS = {
@@ -214,19 +220,11 @@ DRIFTS = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_dr
 
 
 def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
-    """Return random plants: for each plant, the values of its arguments, drawn from `SPANS`.
+    """Return `count` random plants: for each, the values of its arguments, drawn from `SPANS`.
 
-    The values form a Latin hypercube. The second half of the plants drift: the factors of gain
-    and time constant change, over `samples` samples, to other values within `SPANS`.
-
-    Parameters
-    ----------
-    count
-        Number of plants.
-    seed
-        Seed of the Latin hypercube.
-    samples
-        Duration of the drifts, in samples.
+    The values form a Latin hypercube with the seed `seed`. The second half of the plants drift:
+    the factors of gain and time constant change, over `samples` samples, to other values within
+    `SPANS`.
     """
     from scipy.stats.qmc import LatinHypercube  # here: slow to import
 
@@ -237,7 +235,7 @@ def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
     rows = (low + shares * (high - low)).round(4).tolist()
     plants: list[Arguments] = []
     for i, row in enumerate(rows):
-        plant = dict(zip(SPANS, row, strict=False))
+        plant = dict(zip(SPANS, row, strict=False))  # without the factors after a drift
         plant["delay"] = round(plant["delay"])
         if i >= count // 2:
             final_factors = row[len(SPANS) :]
@@ -256,12 +254,8 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
     scaled in the same way. The noise variance is scaled with the square of the temperature
     change that the flow can cause. All other arguments keep their values.
 
-    Parameters
-    ----------
-    nominal_plant
-        The environment's arguments for the other plant.
-    variations
-        For each variation, the arguments that differ from the paper's plant.
+    `nominal_plant` has the environment's arguments for the other plant. A variation has the
+    arguments that differ from the nominal plant.
     """
     scales = _scales(Parameters(**nominal_plant))
     paper_scales = _scales(Parameters())
@@ -277,11 +271,11 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
 
 
 def _scales(plant: Parameters) -> dict[str, float]:
-    """Return the quantity of a plant to which `around` scales each argument in `SPANS`.
+    """Return a plant's value of each argument in `SPANS`, with which `around` scales.
 
-    For the noise variance, the quantity is the square of the temperature change by half the
-    range of the flow, degC^2. For any other argument, the quantity is the value of the argument
-    in the nominal plant, which is the plant in the middle of all ranges.
+    If an argument of the plant has a range, the value is the middle of the range. In place of
+    the noise variance, which may be 0, the result has the square of the temperature change by
+    half the range of the flow, degC^2.
     """
     model = nominal(plant)
     reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0  # degC
