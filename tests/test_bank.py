@@ -325,6 +325,12 @@ class TestScales:
                 np.testing.assert_allclose(slow.command, plain.command, atol=0.01)
 
 
+def test_a_controller_with_a_single_model_accepts_a_long_delay():
+    samples = 20_000  # more than the number of models that a bank can have
+    controller = NeuralSmithPredictor(**{**KNOWN, "delay": 8.0 * samples})
+    assert np.isfinite(controller.act(np.zeros(6))).all()
+
+
 @pytest.mark.parametrize("name", ["delay_range", "setpoint_holds"])
 @pytest.mark.parametrize("limits", [(5.0,), (9.0, 3.0), (-1.0, 3.0), (0.0, np.nan), "soon"])
 def test_a_range_of_times_that_is_none_is_refused_when_the_controller_is_made(name, limits):
