@@ -167,7 +167,7 @@ class SelfTuningController(ModelBasedController):
         )
 
     def _setpoint_distribution(self) -> RandomSetpoint | None:
-        """Return the distribution of the set point; None if it is not known.
+        """Return the distribution of random set points; None if `setpoint_holds` is None.
 
         Times are in intervals between changes of the command, and the amplitude is in units of
         the authority (see `agents.bank`).
@@ -255,7 +255,8 @@ class NeuralSelfTuningController(SelfTuningController):
     network: RecurrentNetwork = field(default_factory=RecurrentNetwork.load, repr=False)
 
     def _start(self, n: int) -> None:
-        """Make the parts of the control law, and the network's state, for n plants at rest."""
+        """Make the bank, the observer, the control law and the network's state for n plants at
+        rest."""
         super()._start(n)
         self._state = self.network.initial_state(n)
         self._corrections = self._next_outputs
