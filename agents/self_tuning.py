@@ -255,8 +255,7 @@ class NeuralSelfTuningController(SelfTuningController):
     network: RecurrentNetwork = field(default_factory=RecurrentNetwork.load, repr=False)
 
     def _start(self, n: int) -> None:
-        """Make the bank, the observer, the control law and the network's state for n plants at
-        rest."""
+        """Make bank, observer, control law and the network's state for n plants at rest."""
         super()._start(n)
         self._state = self.network.initial_state(n)
         self._corrections = self._next_outputs
