@@ -241,7 +241,8 @@ class Bank:
         # The whitened s(k - d) of each model.
         self._regressors = np.zeros_like(self._log_priors)
         self.outputs = np.zeros((LAGS, self.n), np.float32)
-        # Sums over past samples, in which old samples are forgotten exponentially.
+        # Sums over past samples, which forget exponentially: squared regressors, regressors
+        # times whitened outputs, and log-likelihoods.
         self._information = np.zeros_like(self._log_priors)
         self._products = np.zeros_like(self._log_priors)
         self._log_likelihoods = np.zeros_like(self._log_priors)

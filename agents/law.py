@@ -241,9 +241,9 @@ class Law:
     The mean model has the output m without delay, the gain g and the pole p. For the target r,
     the flow is
 
-        f = (r + share (r - m) / (1 - p)) / g,
+        f = (r + share (r - m) / (1 - p)) / g.
 
-    after which f is moved out of the dead zone and limited. The term r / g is the flow that
+    The flow f is then moved out of the dead zone and limited. The term r / g is the flow that
     keeps m at r, and the other term closes a share of the gap r - m in one sample. A neural
     network can correct the control law by three outputs: an addition to r in units of the
     noise, a relative change of r in units of the gain's standard deviation, and half the logit

@@ -149,7 +149,7 @@ def open_arrays(
 
 def write_arrays(path: str | PathLike[str], **arrays: Any) -> None:
     """Write arrays by name to the `.npz` file `path`, which `open_arrays` reads."""
-    with Path(path).open("wb") as file:
+    with Path(path).open("wb") as file:  # as NumPy appends ".npz" to a path without it
         np.savez_compressed(file, **arrays)
 
 

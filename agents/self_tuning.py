@@ -156,9 +156,10 @@ class SelfTuningController(ModelBasedController):
             raise ValueError(
                 f"delay_range must hold at most {MOST_DELAYS:,} samples, got {len(delays):,}"
             )
-        of_delays = -0.5 * np.square((delays + 1.0 - likely) / spread)
-        of_constants = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
-        logarithms = of_delays[:, np.newaxis] + of_constants
+        # The delay and the logarithm of the time constant are normally distributed.
+        delay_logarithms = -0.5 * np.square((delays + 1.0 - likely) / spread)
+        constant_logarithms = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
+        logarithms = delay_logarithms[:, np.newaxis] + constant_logarithms
         return Prior(
             time_constants=(self._time_constant * TIME_CONSTANTS)[:, np.newaxis],
             shortest_delays=[first],
