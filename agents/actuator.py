@@ -44,7 +44,7 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
         Half width of the dead zone, t/h; 0 to leave all actions as they are rounded.
     """
     action = np.asarray(2.0 * (command - u_min) / (u_max - u_min) - 1.0, dtype=np.float32)
-    if np.ndim(dead_zone) == 0 and dead_zone <= 0.0:
+    if np.ndim(dead_zone) == 0 and dead_zone <= 0.0:  # to save the time of the rest
         return action
     # The command that the plant computes from the action.
     rounded = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0

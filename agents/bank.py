@@ -57,7 +57,7 @@ LAGS: Final = 4  # number of latest outputs and of latest mean model outputs tha
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of n plants before they are controlled: the models and their probabilities.
+    """The prior knowledge of n plants: the models of a bank and their probabilities.
 
     Each plant has a model for every pair of a delay and a time constant.
     """
@@ -146,7 +146,8 @@ class Whitening:
     Parameters
     ----------
     shape
-        Shape of a sample of the signal; every element is filtered by itself, from rest.
+        Shape of a sample of the signal. The filter treats every element separately, and starts
+        at rest.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -156,10 +157,11 @@ class Whitening:
 
     def __call__(self, signal: Array) -> Array:
         """Return the next sample of the filtered signal, for the next sample of the signal."""
+        # The numerator is 1 - (FAST_POLE + LOAD_POLE) / z + FAST_POLE LOAD_POLE / z^2.
         output: Array = signal - (FAST_POLE + LOAD_POLE) * self._inputs[0]
         output = output + FAST_POLE * LOAD_POLE * self._inputs[1]
-        for coefficient, earlier in zip(NOISE_COLOUR, self._outputs, strict=True):
-            output = output - coefficient * earlier
+        for coefficient, past_output in zip(NOISE_COLOUR, self._outputs, strict=True):
+            output = output - coefficient * past_output
         self._inputs.appendleft(signal)
         self._outputs.appendleft(output)
         return output
@@ -239,7 +241,8 @@ class Bank:
         # The whitened s(k - d) of each model.
         self._regressors = np.zeros_like(self._log_priors)
         self.outputs = np.zeros((LAGS, self.n), np.float32)
-        # Sums over past samples, in which old samples are forgotten exponentially.
+        # Sums over past samples, which forget exponentially: squared regressors, regressors
+        # times whitened outputs, and log-likelihoods.
         self._information = np.zeros_like(self._log_priors)
         self._products = np.zeros_like(self._log_priors)
         self._log_likelihoods = np.zeros_like(self._log_priors)

@@ -129,9 +129,9 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 @cache  # as reading the annotations is slow
-def _validators(controller: type) -> dict[str, Validator]:
-    """Return the validators of a controller's fields by the names of the fields."""
-    annotations = get_type_hints(controller, include_extras=True)
+def _validators(controller_class: type) -> dict[str, Validator]:
+    """Return the validators of a controller class by the names of the fields."""
+    annotations = get_type_hints(controller_class, include_extras=True)
     validators = {}
     for name, annotation in annotations.items():
         if hasattr(annotation, "__metadata__"):  # an `Annotated` type such as `Positive`
@@ -173,11 +173,11 @@ class Controller(ABC):
     n_obs: int = field(init=False, repr=False)
     command: Values = field(init=False, repr=False)
 
-    # Half width of the actuator's dead zone, t/h, if the controller commands its edge: an
-    # action for the edge is rounded such that the flow passes the dead zone.
+    # Half width of the dead zone, t/h, if the controller commands the edge of the dead zone: an
+    # action for the edge is rounded such that the flow passes. Otherwise 0.
     _edge = 0.0
-    # Whether the controller remembers past samples. A controller without memory may get another
-    # batch size at any sample.
+    # Whether the controller remembers past samples. Without memory, the batch size may change
+    # at any sample.
     _remembers = True
 
     def __post_init__(self) -> None:

@@ -66,7 +66,7 @@ class DahlinController(InternalModelController):
             self._filter = -math.expm1(-self.sampling_interval / self.filter_time_constant)
 
     def reset(self) -> None:
-        """Set the model's outputs and the estimated disturbance to 0, before a new episode."""
+        """Set the model's output and the estimated disturbance to 0, before a new episode."""
         super().reset()
         self._disturbance: Values = np.float64(0.0)  # D, degC
 
@@ -83,8 +83,8 @@ class DahlinController(InternalModelController):
         """
         share = self._approach * self._filter
         numerator = share * np.array([1.0, -self._pole])
-        to_setpoint = np.array([1.0, self._approach - 1.0])
-        smoothed = np.convolve(to_setpoint, [1.0, self._filter - 1.0])
+        lag = np.array([1.0, self._approach - 1.0])  # 1 - (1 - g) z^-1
+        smoothed = np.convolve(lag, [1.0, self._filter - 1.0])  # times 1 - (1 - f) z^-1
         in_transit = np.append(np.zeros(self._delay), share)
         return numerator, self._input_gain * polysub(smoothed, in_transit)
 

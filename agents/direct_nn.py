@@ -52,7 +52,8 @@ class Weights:
         A ValueError is raised if the file is damaged or holds something else.
         """
         with open_arrays(path, "weights") as file:
-            return cls(**{field.name: file[field.name] for field in fields(cls)})
+            arrays = {field.name: file[field.name] for field in fields(cls)}
+            return cls(**arrays)
 
 
 @dataclass(eq=False, kw_only=True)

@@ -85,13 +85,14 @@ class RandomSetpoint:
             (n,).
         """
         slopes = 0.5 * LOGISTIC / deviations
-        pulls = (1.0 - held) / self.amplitude
+        pulls_to_zero = (1.0 - held) / self.amplitude
         near_zero = np.zeros_like(setpoints)
         near_setpoint = setpoints
         for _ in range(BISECTIONS):
             targets = 0.5 * (near_zero + near_setpoint)
-            balance = held * np.tanh(slopes * (targets - setpoints)) + pulls * targets
-            is_too_near_zero = balance * np.sign(setpoints) < 0.0
+            left_side = held * np.tanh(slopes * (targets - setpoints)) + pulls_to_zero * targets
+            is_too_near_zero = left_side * np.sign(setpoints) < 0.0
             near_zero = np.where(is_too_near_zero, targets, near_zero)
             near_setpoint = np.where(is_too_near_zero, near_setpoint, targets)
-        return np.where(held >= 1.0, setpoints, 0.5 * (near_zero + near_setpoint))
+        targets = 0.5 * (near_zero + near_setpoint)
+        return np.where(held >= 1.0, setpoints, targets)  # exact for a set point that is kept

@@ -164,7 +164,7 @@ class Observer:
         forecast: Array,
         noise: Array,
     ) -> Array:
-        """Return the observer's inputs of a network, scaled to be of order 1.
+        """Return the observer's inputs of a network, scaled to magnitudes of about 1.
 
         Parameters
         ----------
@@ -241,12 +241,13 @@ class Law:
     The mean model has the output m without delay, the gain g and the pole p. For the target r,
     the flow is
 
-        f = (r + share (r - m) / (1 - p)) / g,
+        f = (r + share (r - m) / (1 - p)) / g.
 
-    moved out of the dead zone and limited. The term r / g is the flow that keeps m at r, and
-    the other term closes a share of the gap r - m in one sample. A neural network can correct
-    the control law by three outputs: an addition to r in units of the noise, a relative change
-    of r in units of the gain's standard deviation, and half the logit of the share.
+    The flow f is then moved out of the dead zone and limited. The term r / g is the flow that
+    keeps m at r, and the other term closes a share of the gap r - m in one sample. A neural
+    network can correct the control law by three outputs: an addition to r in units of the
+    noise, a relative change of r in units of the gain's standard deviation, and half the logit
+    of the share.
 
     Parameters
     ----------
@@ -320,7 +321,7 @@ class Law:
         return flow
 
     def _inputs(self, situation: Situation, model_output: Any, change: Any) -> Any:
-        """Return all inputs of a network, shape (n, INPUTS), of order 1.
+        """Return all inputs of a network, with magnitudes of about 1, shape (n, INPUTS).
 
         `model_output` is the output of the mean model without delay, and `change` its change
         since the last sample, both in units of the authority, shape (n,).

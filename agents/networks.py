@@ -149,7 +149,7 @@ def open_arrays(
 
 def write_arrays(path: str | PathLike[str], **arrays: Any) -> None:
     """Write arrays by name to the `.npz` file `path`, which `open_arrays` reads."""
-    with Path(path).open("wb") as file:
+    with Path(path).open("wb") as file:  # as NumPy appends ".npz" to a path without it
         np.savez_compressed(file, **arrays)
 
 
@@ -283,15 +283,12 @@ class PolicyNetwork(Controller):
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the network, without the limits of the flow, to the `.npz` file `path`."""
-        increments = None
-        if self.increments is not None:
-            increments = asdict(self.increments)
         settings = {
             "format": FORMAT,
             "layers": len(self.layers),
             "observation": self.observation,
             "activation": self.activation,
-            "increments": increments,
+            "increments": None if self.increments is None else asdict(self.increments),
             "provenance": self.provenance,
         }
         arrays = {}
@@ -307,17 +304,18 @@ class PolicyNetwork(Controller):
         `Controller`, the plants must have the observation that the network expects.
         """
         super().check_environment(parameters, wrapped, n)
-        wanted = self.observation
         windows = {name: getattr(parameters, name) for name in WINDOWS}
-        if windows != wanted:
+        if windows != self.observation:
             raise ValueError(
-                f"env must have the windows that policy wants, {wanted}, got {windows}"
+                f"env must have the windows that policy wants, {self.observation}, "
+                f"got {windows}"
             )
 
     def reset(self) -> None:
         """Set the wanted flow of the velocity form to 0, before a new episode."""
         super().reset()
-        self._flow: Values = np.float64(0.0)  # wanted, as a share of half the range
+        # The wanted flow, in units of half the actuator's range.
+        self._flow: Values = np.float64(0.0)
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the commands u(k), t/h, shape (loops,), and update the wanted flow.
@@ -334,26 +332,25 @@ class PolicyNetwork(Controller):
         half_range = (self.u_max - self.u_min) / 2.0
         if self.increments is None:
             return self.u_min + (output + 1.0) * half_range
-        wanted = self._flow + self.increments.max_move * output
         lowest = self.u_min / half_range
-        flow = np.clip(wanted, lowest, self.u_max / half_range)
-        self._flow = flow
+        highest = self.u_max / half_range
+        moved = self._flow + self.increments.max_move * output
+        self._flow = np.clip(moved, lowest, highest)
         if self.increments.dead_zone == 0.0:
-            return self.u_min + (flow - lowest) * half_range
-        return self._compensated(flow, self.increments.dead_zone)
+            return self.u_min + (self._flow - lowest) * half_range
+        return self._compensated(self.increments.dead_zone)
 
-    def _compensated(self, flow: Array, edge: float) -> NDArray[np.float64]:
-        """Return the commands, t/h, shape (loops,), that compensate the dead zone.
+    def _compensated(self, edge: float) -> NDArray[np.float64]:
+        """Return the commands for the wanted flows, t/h, with the dead zone compensated.
 
-        The rule is that of `Increments.dead_zone`. `flow` are the wanted flows, as shares of
-        half the actuator's range, shape (loops,), and `edge` is the half width of the dead
-        zone, t/h.
+        The rule is that of `Increments.dead_zone`. `edge` is the half width of the dead zone,
+        t/h, and the commands have the shape (loops,).
         """
+        flow = self._flow
         half_range = (self.u_max - self.u_min) / 2.0
         # The limit in the direction of the flow, t/h; any number other than 0 for a flow of 0.
         limit = np.where(flow > 0.0, self.u_max, np.where(flow < 0.0, -self.u_min, 1.0))
         share = np.abs(flow) * (half_range / limit)
-        command: NDArray[np.float64] = np.sign(flow) * (
-            edge + share * np.maximum(limit - edge, 0.0)
-        )
+        size = edge + share * np.maximum(limit - edge, 0.0)
+        command: NDArray[np.float64] = np.sign(flow) * size
         return command

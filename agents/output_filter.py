@@ -101,7 +101,7 @@ class OutputFilter:
             Variances of the bank's one-step errors, in units of the authority squared, shape
             (n,).
         """
-        # Responses of the past change if the bank has changed the mean model.
+        # The bank may have changed the mean model since the last sample.
         response, last_response = responses
         self._attribute_to_load(last_response - self._response, poles)
         self._response = response
@@ -167,7 +167,7 @@ class OutputFilter:
         self._states[:, :, LOAD] += residuals
 
     def _matrices(self, poles: Array, noises: Array) -> tuple[Array, Array]:
-        """Return the transition matrices and noise covariances of the state equations.
+        """Return the transition matrices and the noise covariances of the filters' states.
 
         Parameters
         ----------
@@ -188,6 +188,7 @@ class OutputFilter:
         n = len(poles)
         a1 = poles + FAST_POLE
         a2 = -poles * FAST_POLE
+        # Row i of a transition matrix has the factors from which element i of a state follows.
         transition = np.zeros((n, 4, 4))
         transition[:, RESIDUAL, RESIDUAL] = a1
         transition[:, RESIDUAL, CARRIED] = 1.0
@@ -195,14 +196,15 @@ class OutputFilter:
         transition[:, CARRIED, RESIDUAL] = a2
         transition[:, LOAD, LOAD] = LOAD_MEMORY
         transition[:, GAIN, GAIN] = 1.0
+        # The effects of the noises xi and eta on the elements of a state.
         from_xi = np.array([1.0, NOISE_COLOUR[0], 0.0, 0.0])
         from_eta = np.zeros((n, 4))
         from_eta[:, RESIDUAL] = 1.0 - a1 - a2
         from_eta[:, LOAD] = 1.0
-        of_xi = (1.0 - READING_SHARE) * noises[:, :, np.newaxis, np.newaxis]
-        of_eta = np.square(LOAD_CHANGES)[:, np.newaxis, np.newaxis, np.newaxis]
-        covariances = of_xi * np.outer(from_xi, from_xi)
-        covariances += of_eta * (from_eta[:, :, np.newaxis] * from_eta[:, np.newaxis, :])
+        xi_variances = (1.0 - READING_SHARE) * noises[:, :, np.newaxis, np.newaxis]
+        eta_variances = np.square(LOAD_CHANGES)[:, np.newaxis, np.newaxis, np.newaxis]
+        covariances = xi_variances * np.outer(from_xi, from_xi)
+        covariances += eta_variances * (from_eta[:, :, np.newaxis] * from_eta[:, np.newaxis, :])
         covariances[:, :, GAIN, GAIN] += self._gain_changes
         return transition, covariances
 

@@ -116,7 +116,7 @@ class PIController(Controller):
         return cls(kp, ki, **arguments)
 
     def reset(self) -> None:
-        """Set the sum of the errors to zero, before a new episode."""
+        """Set the sum of the errors to 0, before a new episode."""
         super().reset()
         self._sum: Values = np.float64(0.0)  # of all errors so far
 

@@ -156,9 +156,10 @@ class SelfTuningController(ModelBasedController):
             raise ValueError(
                 f"delay_range must hold at most {MOST_DELAYS:,} samples, got {len(delays):,}"
             )
-        of_delays = -0.5 * np.square((delays + 1.0 - likely) / spread)
-        of_constants = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
-        logarithms = of_delays[:, np.newaxis] + of_constants
+        # The delay and the logarithm of the time constant are normally distributed.
+        delay_logarithms = -0.5 * np.square((delays + 1.0 - likely) / spread)
+        constant_logarithms = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
+        logarithms = delay_logarithms[:, np.newaxis] + constant_logarithms
         return Prior(
             time_constants=(self._time_constant * TIME_CONSTANTS)[:, np.newaxis],
             shortest_delays=[first],
@@ -167,7 +168,7 @@ class SelfTuningController(ModelBasedController):
         )
 
     def _setpoint_distribution(self) -> RandomSetpoint | None:
-        """Return the distribution of the set point; None if it is not known.
+        """Return the distribution of random set points; None if `setpoint_holds` is None.
 
         Times are in intervals between changes of the command, and the amplitude is in units of
         the authority (see `agents.bank`).
@@ -255,7 +256,7 @@ class NeuralSelfTuningController(SelfTuningController):
     network: RecurrentNetwork = field(default_factory=RecurrentNetwork.load, repr=False)
 
     def _start(self, n: int) -> None:
-        """Make the parts of the control law, and the network's state, for n plants at rest."""
+        """Make bank, observer, control law and the network's state for n plants at rest."""
         super()._start(n)
         self._state = self.network.initial_state(n)
         self._corrections = self._next_outputs

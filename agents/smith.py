@@ -69,7 +69,7 @@ class SmithPredictor(InternalModelController):
         self.n_obs = self.error_index + 1
 
     def reset(self) -> None:
-        """Set the integral to zero and the model's outputs to 0, before a new episode."""
+        """Set the integral and the model's output to 0, before a new episode."""
         super().reset()
         self._integral: Values = np.float64(0.0)  # -Ki times the sum of past errors, t/h
 
@@ -85,14 +85,16 @@ class SmithPredictor(InternalModelController):
         numerator, denominator
             Coefficients of z^0, z^-1 and so on.
         """
-        pi, integral = PIController(self.kp, self.ki).transfer()
-        model = np.array([0.0, self._input_gain]), np.array([1.0, -self._pole])
-        ahead = np.zeros(self._delay)  # 1 - z^-(delay - 1): inputs in transit
-        ahead[0] += 1.0
-        ahead[-1] -= 1.0
-        outgoing = np.convolve(integral, model[1])
-        returning = np.convolve(np.convolve(pi, model[0]), ahead)
-        return np.convolve(pi, model[1]), polyadd(outgoing, returning)
+        pi_numerator, pi_denominator = PIController(self.kp, self.ki).transfer()
+        model_numerator = np.array([0.0, self._input_gain])
+        model_denominator = np.array([1.0, -self._pole])
+        # The undelayed minus the delayed model is the model times 1 - z^-(delay - 1).
+        in_transit = np.zeros(self._delay)
+        in_transit[0] += 1.0
+        in_transit[-1] -= 1.0
+        forward = np.convolve(pi_denominator, model_denominator)
+        feedback = np.convolve(np.convolve(pi_numerator, model_numerator), in_transit)
+        return np.convolve(pi_numerator, model_denominator), polyadd(forward, feedback)
 
     def _control(self, rows: Array) -> Array:
         """Return the commands u(k), t/h, shape (loops,), and advance the model by a sample.

@@ -1,6 +1,5 @@
-"""The controllers: equations by hand and by automatic differentiation, batches, files."""
+"""Test the controllers: their equations, batches of loops, files and errors."""
 
-import inspect
 import itertools
 import json
 import pickle
@@ -14,12 +13,11 @@ from gymnasium.utils.env_checker import data_equivalence
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-import agents
 from agents import (
-    Controller,
     DahlinController,
     DirectNNController,
     Increments,
+    NeuralSelfTuningController,
     NeuralSmithPredictor,
     PIController,
     PolicyNetwork,
@@ -35,22 +33,20 @@ from mptc_gym.wrappers import IncrementalAction
 from tests.conftest import STEP_TEST, assert_the_seed_is_all_that_differs
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
-# Each controller is told what it has to be told.
-TOLD = {**STEP_TEST, "closed_loop_time_constant": 80.0}
-NEEDS = {
-    name: {p.name for p in inspect.signature(each).parameters.values() if p.default is p.empty}
-    for name, each in vars(agents).items()
-    if isinstance(each, type) and issubclass(each, Controller) and each is not Controller
+TUNED = {**STEP_TEST, "closed_loop_time_constant": 80.0}
+MAKERS = {  # of every controller that reads set points and errors alone
+    "nn": partial(DirectNNController),
+    "pi": partial(PIController),
+    "smith": partial(SmithPredictor, **TUNED),
+    "dahlin": partial(DahlinController, **TUNED),
+    "self-tuning": partial(SelfTuningController, **STEP_TEST),
+    "neural-smith": partial(NeuralSmithPredictor, **STEP_TEST),
+    "neural-self-tuning": partial(NeuralSelfTuningController, **STEP_TEST),
 }
-MAKERS = {
-    name: partial(getattr(agents, name), **{argument: TOLD[argument] for argument in needed})
-    for name, needed in NEEDS.items()
-    if needed <= set(TOLD)
-}
-# A slow lambda would leave small errors inside the dead zone alone.
+# With a long time constant, Dahlin's controller does not correct errors inside the dead zone.
 INTERNAL_MODELS = (
-    partial(SmithPredictor, **TOLD),
-    partial(DahlinController, **{**TOLD, "closed_loop_time_constant": 16.0}),
+    partial(SmithPredictor, **TUNED),
+    partial(DahlinController, **{**TUNED, "closed_loop_time_constant": 16.0}),
 )
 WINDOWS = {"setpoint_window": 1, "output_window": 2, "action_window": 2}
 
@@ -61,14 +57,17 @@ def make(request):
 
 
 def of_loops(make, n):
+    """Return a controller of n loops; `make` is a value of `MAKERS`."""
     return make(num_envs=n) if make.func is DirectNNController else make()
 
 
-def same(first, second):
-    return all(np.array_equal(getattr(first, f), getattr(second, f)) for f in FIELDS)
+def are_equal(first, second):
+    """Return whether the weights of two paper networks are equal to the bit."""
+    return data_equivalence(vars(first), vars(second), exact=True)
 
 
 def layers(*sizes):
+    """Return random layers of a network with these numbers of inputs, nodes and outputs."""
     generator = np.random.default_rng(0)
     return [
         (generator.normal(size=(after, before)), generator.normal(size=after))
@@ -77,14 +76,21 @@ def layers(*sizes):
 
 
 def policy(**arguments):
-    given = {"observation": WINDOWS, "input_scale": [0.2] * 3 + [1.0] * 2, **arguments}
-    return PolicyNetwork(**{"layers": layers(5, 7, 6, 1), **given})
+    """Return a policy with random layers, five inputs and these other arguments."""
+    defaults = {
+        "layers": layers(5, 7, 6, 1),
+        "observation": WINDOWS,
+        "input_scale": [0.2] * 3 + [1.0] * 2,
+    }
+    return PolicyNetwork(**defaults | arguments)
 
 
-def gain_of(weight, bias, **arguments):
-    """Return a policy of one weight: its output before scaling is `weight` e + `bias`."""
-    only = [(np.array([[weight]]), np.array([bias]))]
-    return PolicyNetwork(only, observation={"error_window": 1}, input_scale=[1.0], **arguments)
+def one_weight_policy(weight, bias, **arguments):
+    """Return a policy whose output is `weight` e + `bias`, for the error e."""
+    layer = np.array([[weight]]), np.array([bias])
+    return PolicyNetwork(
+        [layer], observation={"error_window": 1}, input_scale=[1.0], **arguments
+    )
 
 
 @pytest.mark.parametrize(
@@ -119,7 +125,7 @@ BAD_OBSERVATIONS = [
     np.zeros(3), np.zeros((2, 2, 6)), np.zeros((2, 6)), np.full(6, np.nan), "text", None,
     ["1"] * 6, np.zeros(6) * 1j, [10**400] * 6, (np.zeros(6), {}),  # what `reset` returns
 ]  # fmt: skip
-REFUSED = [  # arguments of the environment, its wrappers, and what is named
+REFUSED = [  # arguments and wrappers of an environment, and the message of the error
     ({"u_max": 12.0}, "", r"u_max=12\.0, got -10\.0, 10\.0"),
     ({"u_min": [-12.0, -8.0]}, "", r"u_min=-12\.0"),
     ({"setpoint_window": 2}, "", "newest error as element 3"),
@@ -146,16 +152,17 @@ class TestEveryController:
                 controller.act(bad)
             assert np.array_equal(controller.act(np.ones(6)), twin.act(np.ones(6)))
 
-    def test_a_loop_in_a_batch_is_one_alone_whatever_else_it_is_shown(self, make, rng):
+    def test_a_loop_in_a_batch_gets_the_actions_of_a_single_loop(self, make, rng):
         batch = of_loops(make, 3)
         singles = [make(seed=i) if "seed" in vars(batch) else make() for i in range(3)]
-        # To the bit, but for banks and networks in float32, whose sums have another order.
+        # Bit for bit, apart from the order of float32 sums in banks and networks.
         tolerance = 1e-4 if isinstance(batch, SelfTuningController) else 0.0
         for _ in range(60):
-            seen = rng.normal(0.0, 3.0, (3, 6))
-            alone = [each.act(row) for each, row in zip(singles, seen, strict=True)]
-            longer = np.column_stack([seen, rng.normal(size=(3, 2))])
-            np.testing.assert_allclose(batch.act(longer), alone, rtol=0.0, atol=tolerance)
+            rows = rng.normal(0.0, 3.0, (3, 6))
+            alone = [single.act(row) for single, row in zip(singles, rows, strict=True)]
+            longer_rows = np.column_stack([rows, rng.normal(size=(3, 2))])
+            actions = batch.act(longer_rows)
+            np.testing.assert_allclose(actions, alone, rtol=0.0, atol=tolerance)
 
     def test_the_number_of_loops_is_fixed_until_reset(self, make):
         controller = of_loops(make, 3)
@@ -171,18 +178,18 @@ class TestEveryController:
 
     def test_plants_that_it_was_not_made_for_are_refused(self, make):
         controller = of_loops(make, 1)
-        drawn = Parameters(u_min=[-10.0, -8.0], output_window=2)
-        controller.check_environment(drawn, "", 1)
+        random_plant = Parameters(u_min=[-10.0, -8.0], output_window=2)
+        controller.check_environment(random_plant, "", 1)
         for arguments, wrapped, message in REFUSED:
             with pytest.raises(ValueError, match=message):
                 controller.check_environment(Parameters(**arguments), wrapped, 1)
 
 
-def test_plants_that_one_kind_alone_refuses():
-    without = Parameters(setpoint_window=0)
-    PIController(error_index=0).check_environment(without, "", 5)
+def test_some_controllers_refuse_more_plants():
+    errors_alone = Parameters(setpoint_window=0)
+    PIController(error_index=0).check_environment(errors_alone, "", 5)
     with pytest.raises(ValueError, match="newest setpoint as element 0"):
-        NeuralSmithPredictor(**STEP_TEST, error_index=0).check_environment(without, "", 5)
+        NeuralSmithPredictor(**STEP_TEST, error_index=0).check_environment(errors_alone, "", 5)
     for loops in (None, 2):
         with pytest.raises(ValueError, match="num_envs=3, one loop per episode"):
             DirectNNController(num_envs=loops).check_environment(Parameters(), "", 3)
@@ -201,7 +208,7 @@ class TestDirectNN:
         direction=st.sampled_from([-1, 1]),
         seed=st.integers(0, 10**6),
     )
-    def test_updates_are_the_gradient_that_autograd_finds(
+    def test_weights_move_along_the_gradient_of_automatic_differentiation(
         self, n_inputs, n_hidden, direction, seed
     ):
         torch = pytest.importorskip("torch", reason="the controllers need no PyTorch")
@@ -224,7 +231,7 @@ class TestDirectNN:
             np.testing.assert_allclose(moved, -gain * leaf.grad.numpy(), atol=1e-12)
 
     @pytest.mark.parametrize("n_hidden", [1, 9])
-    def test_a_batch_with_many_inputs_is_its_members_to_the_bit(self, n_hidden, rng):
+    def test_networks_of_a_batch_equal_single_networks_bit_for_bit(self, n_hidden, rng):
         shape = {"n_inputs": 12, "n_hidden": n_hidden, "error_index": 0}
         batch = DirectNNController(seed=5, num_envs=7, **shape)
         singles = [DirectNNController(seed=5 + i, **shape) for i in range(7)]
@@ -233,17 +240,18 @@ class TestDirectNN:
             [nn.act(row) for nn, row in zip(singles, observation, strict=True)]
             assert np.array_equal(batch.command, [nn.command for nn in singles])
 
-    def test_initial_weights_are_uniform_and_of_the_seed_alone(self):
+    def test_initial_weights_are_uniform_and_depend_on_the_seed_alone(self):
         weights = DirectNNController(num_envs=2000, weight_scale=0.5).weights
         for field in FIELDS:
             values = getattr(weights, field)
             assert np.abs(values).max() <= 0.5
             quartiles = np.quantile(values, [0.25, 0.5, 0.75])
             assert quartiles == pytest.approx([-0.25, 0, 0.25], abs=0.04)
-        made = DirectNNController
-        assert_the_seed_is_all_that_differs(lambda seed: made(seed=seed).weights.W)
+        assert_the_seed_is_all_that_differs(
+            lambda seed: DirectNNController(seed=seed).weights.W
+        )
 
-    def test_weights_are_copied_and_those_of_one_network_set_a_batch(self):
+    def test_weights_are_copied_and_can_be_assigned_to_a_whole_batch(self):
         given = DirectNNController(seed=3).weights
         batch = DirectNNController(num_envs=2)
         batch.weights = given
@@ -260,19 +268,19 @@ class TestDirectNN:
         for field, value in bad:
             with pytest.raises(ValueError, match=rf"weights\.{field}"):
                 nn.weights = Weights(**others | {field: value})
-            assert same(nn.weights, before)
+            assert are_equal(nn.weights, before)
 
-    def test_it_learns_at_every_third_sample_if_so_asked_as_long_as_it_is_to_learn(self):
+    def test_weights_change_at_every_third_sample_while_learning_is_on(self):
         nn = DirectNNController(update_interval=3)
         changed = []
         for k in range(12):
             before = nn.weights
             if k == 7:  # the count begins again, the weights stay
                 nn.reset()
-                assert same(nn.weights, before)
+                assert are_equal(nn.weights, before)
             nn.learning = k < 10
             nn.act(np.ones(6))
-            changed.append(not same(nn.weights, before))
+            changed.append(not are_equal(nn.weights, before))
         assert np.flatnonzero(changed).tolist() == [0, 3, 6, 7]  # and not 10
 
     def test_extreme_inputs_do_not_overflow(self):
@@ -302,24 +310,24 @@ def test_simc_by_hand():
         (2.0, {"dead_zone": 5.0, "u_min": -3.0}),  # the limit lies inside the dead zone
     ],
 )
-def test_with_the_right_model_there_is_no_delay_to_the_loop(setpoint, actuator):
+def test_with_the_right_model_the_delay_only_shifts_the_output(setpoint, actuator):
     # On a plant that is its model, the output is that of the loop without delay, later.
     pole = np.exp(-8 / 161)
     plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), **actuator}
     plant["setpoint"] = setpoint
     outputs = []
     for delay in (0, 18):
-        smith = SmithPredictor(**{**TOLD, "delay": 8.0 * (delay + 1), **actuator})
+        smith = SmithPredictor(**{**TUNED, "delay": 8.0 * (delay + 1), **actuator})
         trajectory = rollout(make_plants(1, 200, **plant, delay=delay), smith, 200, seed=0)
         outputs.append(trajectory.output[delay : 182 + delay])
     np.testing.assert_allclose(*outputs, atol=1e-4)
 
 
-def test_dahlins_response_is_a_first_order_lag_after_the_delay():
+def test_the_response_with_dahlins_controller_is_a_first_order_lag_after_the_delay():
     pole, samples = np.exp(-8 / 161), np.arange(100)
     plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), "dead_zone": 0.0}
     for filter_time_constant in (0.0, 100.0):
-        controller = DahlinController(**TOLD, filter_time_constant=filter_time_constant)
+        controller = DahlinController(**TUNED, filter_time_constant=filter_time_constant)
         found = rollout(make_plants(1, 119, **plant, setpoint=2.0), controller, 119, seed=0)
         # lambda = 80 s is ten samples; the delay is 19.
         lag = 2.0 * (1.0 - np.exp(-samples / 10.0))
@@ -327,14 +335,14 @@ def test_dahlins_response_is_a_first_order_lag_after_the_delay():
     # The filter acts on loads alone, of which it takes 1 - exp(-8 / 100) in the first sample.
     commands = []
     for filter_time_constant in (0.0, 100.0):
-        controller = DahlinController(**TOLD, filter_time_constant=filter_time_constant)
+        controller = DahlinController(**TUNED, filter_time_constant=filter_time_constant)
         controller.act([0.0, 0.0, 0.0, 0.5])
         commands.append(controller.command)
     assert commands[1] / commands[0] == pytest.approx(1.0 - np.exp(-0.08))
 
 
 @pytest.mark.parametrize("make", INTERNAL_MODELS)
-def test_nothing_winds_up_at_a_limit_or_sticks_in_the_dead_zone(make):
+def test_no_controller_winds_up_at_a_limit_or_stays_in_the_dead_zone(make):
     controller = make(dead_zone=5.0)
     # 9 degC are out of reach; 6 degC take 8.8 t/h. The valve must leave its limit at once.
     plants = make_plants(1, 320, setpoint=[9.0] * 300 + [6.0])
@@ -349,9 +357,9 @@ def test_nothing_winds_up_at_a_limit_or_sticks_in_the_dead_zone(make):
 
 def test_a_command_on_the_edge_of_the_dead_zone_has_an_effect():
     # float32(0.7) stands for less than 7 t/h.
-    smith = SmithPredictor(**TOLD, dead_zone=7.0)
+    smith = SmithPredictor(**TUNED, dead_zone=7.0)
     smith.kp, smith.ki = 7.0, 0.0  # u = -7 at e = 1
-    network = gain_of(-1e-12, 0.0, increments=Increments(0.4, dead_zone=7.0))
+    network = one_weight_policy(-1e-12, 0.0, increments=Increments(0.4, dead_zone=7.0))
     for controller, shown in ((smith, [0.0, 0, 0, 1.0]), (network, [1.0])):
         assert np.float64(controller.act(shown)[0]) * 10.0 <= -7.0
 
@@ -373,7 +381,7 @@ class TestPolicyNetwork:
         assert network.act(x) == pytest.approx(expected, abs=1e-5)
 
     def test_commands_fit_other_limits(self):
-        network = gain_of(0.0, 0.5, u_min=-4.0, u_max=8.0)
+        network = one_weight_policy(0.0, 0.5, u_min=-4.0, u_max=8.0)
         assert network.act([[0.0]]) == pytest.approx(0.5)
         assert network.command == pytest.approx(5.0)  # three quarters of the way up
 
@@ -391,7 +399,7 @@ class TestPolicyNetwork:
         self, u_min, u_max, dead_zone, max_move, outputs
     ):
         increments = Increments(max_move, dead_zone)
-        network = gain_of(1.0, 0.0, increments=increments, u_min=u_min, u_max=u_max)
+        network = one_weight_policy(1.0, 0.0, increments=increments, u_min=u_min, u_max=u_max)
         plant = MiddlePointEnv(dead_zone=0.0, u_min=u_min, u_max=u_max)
         wrapped = IncrementalAction(plant, max_move=max_move, compensate_dead_zone=dead_zone)
         wrapped.reset(seed=0)
@@ -400,12 +408,15 @@ class TestPolicyNetwork:
             network.act([output])
             command = wrapped.step(output[np.newaxis])[-1]["command"]
             flow = np.clip(flow + most * np.clip(output, -1.0, 1.0), u_min, u_max)
-            # Where the wanted flow is 0 but for rounding, its sign is chance.
+            # If the wanted flow is 0 apart from rounding, its sign is random.
             if abs(flow) > 1e-5:
                 assert network.command == pytest.approx(command, abs=2e-5)
 
-    def test_without_increments_batches_may_change_but_never_windows(self):
-        network, moving = gain_of(0.0, 0.5), gain_of(0.0, 0.5, increments=Increments(0.8))
+    def test_only_a_policy_without_increments_may_change_its_batch_size(self):
+        network, moving = (
+            one_weight_policy(0.0, 0.5),
+            one_weight_policy(0.0, 0.5, increments=Increments(0.8)),
+        )
         for each in (network, moving):
             each.act([[0.0], [0.0]])
         network.act([[0.0]])
@@ -415,7 +426,7 @@ class TestPolicyNetwork:
             with pytest.raises(ValueError, match=r"^observation must .*5[ ,]"):
                 policy().act(np.zeros(size))
 
-    def test_what_does_not_fit_in_a_file_is_refused_and_limits_are_named(self, tmp_path):
+    def test_files_with_wrong_settings_are_refused(self, tmp_path):
         path = tmp_path / "policy.npz"
         policy().save(path)
         with pytest.raises(ValueError, match=r"^u_min must be below u_max"):
@@ -433,6 +444,8 @@ class TestPolicyNetwork:
 
 
 class Harm:
+    """An object that prints if a file with its pickle is loaded."""
+
     def __reduce__(self):
         return print, ("executed",)
 
@@ -445,7 +458,7 @@ SAVED = {
 
 
 @pytest.mark.parametrize("kind", SAVED)
-def test_what_is_saved_is_loaded_and_what_is_damaged_is_refused(tmp_path, kind):
+def test_saved_files_are_loaded_and_damaged_files_are_refused(tmp_path, kind):
     path = tmp_path / "kept.npz"
     SAVED[kind].save(path)
     loaded = SAVED[kind].load(path)
@@ -459,11 +472,11 @@ def test_what_is_saved_is_loaded_and_what_is_damaged_is_refused(tmp_path, kind):
         damaged = bytearray(data)
         damaged[place] ^= 0xFF
         path.write_bytes(damaged)
-        with suppress(ValueError):  # and no other; some bytes nobody reads
+        with suppress(ValueError):  # not every damaged byte is read, so an error may be missing
             SAVED[kind].load(path)
 
 
-def test_nothing_in_a_file_of_something_else_is_executed(tmp_path, capsys):
+def test_nothing_in_a_foreign_file_is_executed(tmp_path, capsys):
     harm = np.array(Harm(), dtype=object)
     np.savez(tmp_path / "object.npz", about=harm, W=harm, input_weights=harm)
     np.savez_compressed(tmp_path / "large.npz", W=np.zeros(2**23 + 1))
@@ -488,10 +501,10 @@ BAD = {
         ("gain", 0.0), ("time_constant", 0.0), ("delay", -1.0), ("u_min", 10.0),
         ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0), ("u_min", -np.inf),
     ],
-    partial(DahlinController, **TOLD): [
+    partial(DahlinController, **TUNED): [
         ("closed_loop_time_constant", 0.0), ("filter_time_constant", -1.0),
     ],
-    partial(SmithPredictor, **TOLD): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
+    partial(SmithPredictor, **TUNED): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
     partial(NeuralSmithPredictor, **STEP_TEST): [
         ("gain", 0.0), ("time_constant", 0.0), ("delay", 1e12), ("dead_zone", np.nan),
     ],
@@ -507,13 +520,12 @@ BAD = {
         ("layers", layers(4, 3, 1)), ("layers", layers(5, 3, 2)),
         ("layers", [(np.full((1, 5), np.nan), np.zeros(1))]),
     ],
-    Increments: [("max_move", -0.1), ("dead_zone", np.nan)],
+    partial(Increments, max_move=1.0): [("max_move", -0.1), ("dead_zone", np.nan)],
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("made", "name", "value"), [(made, *each) for made, bad in BAD.items() for each in bad]
-)
-def test_bad_arguments_are_named(made, name, value):
-    with pytest.raises(ValueError, match=name):
-        made(**{"max_move": 1.0, name: value} if made is Increments else {name: value})
+@pytest.mark.parametrize("make", BAD)
+def test_bad_arguments_are_named(make):
+    for name, value in BAD[make]:
+        with pytest.raises(ValueError, match=name):
+            make(**{name: value})

@@ -1,4 +1,4 @@
-"""The bank of models, the law and its network, which is the same in both libraries."""
+"""Test the bank of models, the filter, the hedge and the control law in NumPy and PyTorch."""
 
 from functools import partial
 
@@ -26,7 +26,7 @@ DELAY, CONSTANT = 5, 12.0  # samples
 
 
 def lively_net():
-    """Return a network whose outputs matter."""
+    """Return a network whose corrections of the control law are large."""
     torch.manual_seed(3)
     net = Net(nodes=8, hidden=6)
     with torch.no_grad():
@@ -112,7 +112,7 @@ class TestOutputFilter:
     POLE, VARIANCE, SPREAD, SAMPLES = 0.95, 0.04, 0.3, 60
 
     def filtered(self, responses, outputs):
-        """Return the filter after all samples."""
+        """Return the filter after all samples of one plant."""
         kalman = OutputFilter([self.SPREAD])
         pole, variance = np.array([self.POLE]), np.array([self.VARIANCE])
         for k in range(1, len(outputs)):
@@ -152,7 +152,7 @@ class TestOutputFilter:
         load = change**2 * (of_load @ weights) @ surprise
         assert kalman.load[0] == pytest.approx(load, abs=1e-9)
 
-    def test_a_steady_load_is_told_from_noise_by_the_likelier_filter(self, rng):
+    def test_the_most_likely_filter_distinguishes_a_steady_load_from_noise(self, rng):
         noise = 0.2 * rng.normal(size=600)
         calm = self.filtered(np.zeros(600), noise)
         loaded = self.filtered(np.zeros(600), noise + 2.0 * (np.arange(600) > 300))
@@ -175,11 +175,11 @@ class TestOutputFilter:
 class TestRandomSetpoint:
     SETPOINT = RandomSetpoint(shortest=100.0, longest=300.0, amplitude=5.0)
 
-    def test_the_chance_to_be_held_is_that_of_counted_lengths(self):
-        lengths = np.arange(100, 301)
+    def test_the_probability_of_a_level_is_the_share_of_longer_durations(self):
+        durations = np.arange(100, 301)
         for age, ahead in ((0, 19), (85, 19), (150, 25), (270, 19)):
-            going = lengths[lengths > age]
-            share = (going > age + ahead).mean()
+            possible = durations[durations > age]
+            share = (possible > age + ahead).mean()
             held = self.SETPOINT.probability_held(np.array([age]), np.array([ahead]))
             assert held[0] == pytest.approx(share, abs=1e-12)
 
@@ -265,7 +265,7 @@ def test_every_command_is_0_or_passes_the_dead_zone(make, observations, dead_zon
 
 
 @pytest.mark.parametrize("kind", [SelfTuningController, NeuralSelfTuningController])
-def test_nonsense_does_not_lead_to_nonsense(kind, network, rng):
+def test_huge_observations_lead_to_finite_commands_and_estimates(kind, network, rng):
     options = {"network": network} if kind is NeuralSelfTuningController else {}
     controller = kind(**KNOWN, **options)
     for scale in (1.0, 1e3, 1e6, 1.0):
@@ -287,7 +287,7 @@ def test_neither_a_wrong_gain_nor_a_steady_load_leaves_an_offset():
 
 
 class TestScales:
-    """Units of flow, temperature and time do not matter."""
+    """Commands do not depend on the units of flow, temperature and time."""
 
     def commands(self, observations, flow=1.0, temperature=1.0, time=1.0, kind=None, **more):
         controller = NeuralSmithPredictor(
@@ -307,7 +307,7 @@ class TestScales:
         return np.array(commands)
 
     @pytest.mark.parametrize("scale", [{"flow": 10.0}, {"temperature": 4.0}, {"time": 0.1}])
-    def test_of_flows_temperatures_and_times(self, observations, network, scale):
+    def test_commands_scale_with_the_units(self, observations, network, scale):
         plain = self.commands(observations, network=network)
         scaled = self.commands(observations, network=network, **scale)
         np.testing.assert_allclose(scaled, plain, atol=0.01)
@@ -325,8 +325,14 @@ class TestScales:
                 np.testing.assert_allclose(slow.command, plain.command, atol=0.01)
 
 
+def test_a_controller_with_a_single_model_accepts_a_long_delay():
+    samples = 20_000  # more than the number of models that a bank can have
+    controller = NeuralSmithPredictor(**{**KNOWN, "delay": 8.0 * samples})
+    assert np.isfinite(controller.act(np.zeros(6))).all()
+
+
 @pytest.mark.parametrize("name", ["delay_range", "setpoint_holds"])
 @pytest.mark.parametrize("limits", [(5.0,), (9.0, 3.0), (-1.0, 3.0), (0.0, np.nan), "soon"])
-def test_a_range_of_times_that_is_none_is_refused_when_the_controller_is_made(name, limits):
+def test_an_invalid_range_of_times_is_refused_when_a_controller_is_made(name, limits):
     with pytest.raises(ValueError, match=f"{name} must be two finite numbers of at least 0"):
         SelfTuningController(**KNOWN, **{name: limits})
