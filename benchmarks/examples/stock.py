@@ -128,8 +128,7 @@ def main() -> None:
     )
     labels = {"algorithm": options.algorithm, "seed": options.seed}
     curve = Curve(60.0 * options.minutes, labels, options.out)
-    no_limit = 10**9  # samples of experience: the callback ends the training
-    model.learn(no_limit, callback=curve)
+    model.learn(total_timesteps=10**9, callback=curve)  # the callback ends the training earlier
 
 
 if __name__ == "__main__":

@@ -95,13 +95,12 @@ def _act_by_predict(predict: Callable[..., Any], n: int) -> Act:
     the keywords `state`, `episode_start` and `deterministic=True`, without keywords that it
     does not take, and without keywords that a `functools.partial` has set.
     """
-    parameters = inspect.signature(predict).parameters.values()
-    names = {parameter.name for parameter in parameters}
-    takes_any_keyword = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    parameters = inspect.signature(predict).parameters
+    takes_any_keyword = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     set_by_partial = predict.keywords if isinstance(predict, partial) else {}
     keywords = {"state": None, "episode_start": np.ones(n, np.bool_), "deterministic": True}
     for name in [*keywords]:
-        if name in set_by_partial or not (takes_any_keyword or name in names):
+        if name in set_by_partial or not (takes_any_keyword or name in parameters):
             del keywords[name]
 
     def act(observations: Any) -> Any:
