@@ -131,7 +131,7 @@ def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> l
     errors = np.array([sample.infos["error"] for sample in samples[1:]])
     rewards = -np.abs(errors)
     actions_of_all = np.stack(actions)
-    # Arrays have the shape (samples, episodes, ...).
+    # The arrays have an axis of samples, an axis of episodes, and perhaps more.
     return [
         Episode(controller_name, seed, observations[:, i], actions_of_all[:, i], rewards[:, i])
         for i, seed in enumerate(seeds)

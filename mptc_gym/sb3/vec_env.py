@@ -53,12 +53,13 @@ class GymnasiumVecEnv(VecEnv):
         self.spec = spec
         self.group = group
         self.infos: dict[str, Any] = {}
-        self._slices: list[slice] = []  # of the numbers of each batch's environments
+        self._slices: list[slice] = []  # for each batch, the numbers of its environments
         num_envs = 0
         for batch in batches:
             self._slices.append(slice(num_envs, num_envs + batch.num_envs))
             num_envs += batch.num_envs
-        self._next_seeds: list[int | None] = [None] * num_envs  # None: no new seed
+        # The seed of each environment at the next reset; None continues the random numbers.
+        self._next_seeds: list[int | None] = [None] * num_envs
         # Sum of rewards and number of samples in the present episode of each environment.
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, np.int64)

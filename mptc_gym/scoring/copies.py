@@ -116,10 +116,11 @@ class Copy:
         attributes = dict(vars(wrapper))
         if "results_writer" in attributes:
             attributes["results_writer"] = None  # so that the copy of a monitor writes no file
-        if "class_attributes" in attributes:  # of a VecEnvWrapper; what is in it has no copies
+        if "class_attributes" in attributes:
+            # A VecEnvWrapper has these from its class, so the copy has them, too.
             class_attributes = attributes["class_attributes"]
             self._copies[id(class_attributes)] = class_attributes
-        # The inner environments come first: a wrapper looks in them for what it lacks itself.
+        # The inner environments come first: a wrapper takes attributes that it lacks from them.
         inner_names = [name for name in INNER if name in attributes]
         for name in [*inner_names, *attributes]:
             vars(duplicate)[name] = copy.deepcopy(attributes[name], self._copies)

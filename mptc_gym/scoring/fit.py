@@ -74,6 +74,7 @@ def _check_statistics(normaliser: Any) -> None:
     """
     # A wrapper of rewards alone has no statistics of observations.
     statistics = vars(normaliser).get("obs_rms", {})
+    # Of dict observations, a VecNormalize has statistics for each part.
     parts = statistics.values() if isinstance(statistics, dict) else [statistics]
     for part in parts:
         if not part.mean.any() and (part.var == 1.0).all():

@@ -41,9 +41,9 @@ class Form(NamedTuple):
 
 
 def form_of(policy: Any) -> Form:
-    """Return how a policy is called, and on which object.
+    """Return how a policy of any form that `evaluate` takes is called, and on which object.
 
-    A ValueError is raised if the policy has none of the four forms.
+    A ValueError is raised if the policy has none of these forms.
     """
     if is_environment(policy):
         reject("policy", policy, "a policy, which comes first: evaluate(policy, env)")
@@ -51,14 +51,14 @@ def form_of(policy: Any) -> Form:
         reject("policy", policy, "an object with predict or act, not a class")
     function = policy
     while isinstance(function, partial):
-        function = function.func
+        function = function.func  # the function within the partial
     owner = getattr(function, "__self__", function)  # the object of a bound method
     module = owner if isinstance(owner, loaded("torch.nn.Module")) else None
     for method in _METHODS:
         if callable(getattr(policy, method, None)):
             return Form(getattr(policy, method), method, policy, module)
     name = getattr(function, "__name__", "")
-    if name in _METHODS and owner is not function:
+    if name in _METHODS and owner is not function:  # a bound method `predict` or `act`
         return Form(policy, name, owner, module)
     if not callable(policy):
         allowed = "a function, a torch.nn.Module, or an object with predict or act"
