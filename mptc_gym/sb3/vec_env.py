@@ -87,19 +87,18 @@ class GymnasiumVecEnv(VecEnv):
         If neither `seed` nor `set_seeds` has set seeds since the latest reset, the sequences of
         random numbers continue.
         """
-        returned = [
-            batch.reset(seed=self._next_seeds[numbers])
-            for batch, numbers in zip(self.batches, self._slices, strict=True)
-        ]
+        observations = []
+        batch_infos = []
+        self.reset_infos = []
+        for batch, numbers in zip(self.batches, self._slices, strict=True):
+            observations_of_batch, infos = batch.reset(seed=self._next_seeds[numbers])
+            observations.append(observations_of_batch)
+            batch_infos.append(infos)
+            self.reset_infos += [_infos_of_one(infos, row) for row in range(batch.num_envs)]
+        self.infos = _joined(batch_infos)
         self._next_seeds = [None] * self.num_envs
         self._returns[:] = 0.0
         self._lengths[:] = 0
-        observations, infos = zip(*returned, strict=True)  # each has an element for each batch
-        self.infos = _joined(infos)
-        self.reset_infos = []
-        for infos_of_batch, batch in zip(infos, self.batches, strict=True):
-            rows = range(batch.num_envs)
-            self.reset_infos += [_infos_of_one(infos_of_batch, row) for row in rows]
         return np.concatenate(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -126,7 +125,7 @@ class GymnasiumVecEnv(VecEnv):
             batch.step(self._actions[numbers])
             for batch, numbers in zip(self.batches, self._slices, strict=True)
         ]
-        # Each array of a batch is joined with the arrays of other batches.
+        # `zip` collects the observations of all batches, the rewards of all batches, and so on.
         *arrays, batch_infos = zip(*returned, strict=True)
         observations, rewards, terminated, truncated = map(np.concatenate, arrays)
         self.infos = _joined(batch_infos)

@@ -78,8 +78,8 @@ class Copy:
             return self._copies[id(layer)]
         copies_of_inner = [self._copy(inner) for inner in inner_environments(layer)]
         if isinstance(layer, tuple(map(loaded, _RECORDERS))):
-            self._copies[id(layer)] = copies_of_inner[0]
-            return copies_of_inner[0]
+            self._copies[id(layer)] = copies_of_inner[0]  # a recorder wraps one environment
+            return self._copies[id(layer)]
         reason = _why_not_copied(layer)
         if not reason:
             copies_before = dict(self._copies)
