@@ -1,8 +1,7 @@
 """Train PPO of Stable-Baselines3 to control the plant, in a quarter of a minute on one core.
 
 `python benchmarks/examples/sb3.py` trains a policy, saves the policy in `ppo-0.zip`, and prints
-its scores. A score of 0 is that of an idle valve, and a score of 1 means the least possible
-error.
+its scores. The score of an idle valve is 0, and the score of the least possible error is 1.
 
 This file can be copied without any other file; `benchmarks/train/ppo.py` imports it. The
 training works for the following reasons:

@@ -1,7 +1,7 @@
 """Refuse environments that a policy was not trained or made for, as far as this is known.
 
-A model of Stable-Baselines3 and a controller in `agents` know something of their environments;
-a function knows nothing.
+A model of Stable-Baselines3 stores the spaces of its training, and a controller in `agents`
+stores the actuator that it was made for. A function stores neither.
 """
 
 from __future__ import annotations
