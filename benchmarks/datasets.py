@@ -74,8 +74,7 @@ def work(options: Options) -> str:
     folder = Path(os.environ.get(FOLDER_VARIABLE) or DEFAULT_FOLDER)
     root = out_folder(folder.expanduser().absolute(), FOLDER_VARIABLE)
     for dataset_id in dict.fromkeys(options.ids or IDS):  # without repeated ids
-        mean_errors = write(root, dataset_id, options.episodes)
-        print(f"{dataset_id}: {mean_errors}", flush=True)
+        print(f"{dataset_id}: {write(root, dataset_id, options.episodes)}", flush=True)
     return f"The data sets are in {root}"
 
 
@@ -132,7 +131,7 @@ def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> l
     errors = np.array([sample.infos["error"] for sample in samples[1:]])
     rewards = -np.abs(errors)
     actions_of_all = np.stack(actions)
-    # Arrays have the shape (samples, episodes, ...).
+    # The arrays have an axis of samples, an axis of episodes, and perhaps more.
     return [
         Episode(controller_name, seed, observations[:, i], actions_of_all[:, i], rewards[:, i])
         for i, seed in enumerate(seeds)
@@ -211,15 +210,17 @@ def _create(dataset_id: str, episodes: list[Episode]) -> str:
         num_episodes_average_score=EVALUATION_EPISODES,
         data_format="hdf5",
     )
-    metadata = {
-        "behaviour_error": mean_error,
-        "least_possible_error": idle.least_possible,
-        "idle_error": idle.mean_error,
-        "evaluation_seeds": list(idle.seeds),
-    }
-    controllers = [{"controller": episode.controller} for episode in episodes]
-    dataset.storage.update_metadata(metadata)
-    dataset.storage.update_episode_metadata(controllers)
+    dataset.storage.update_metadata(
+        {
+            "behaviour_error": mean_error,
+            "least_possible_error": idle.least_possible,
+            "idle_error": idle.mean_error,
+            "evaluation_seeds": list(idle.seeds),
+        }
+    )
+    dataset.storage.update_episode_metadata(
+        [{"controller": episode.controller} for episode in episodes]
+    )
     return (
         f"mean |e| {mean_error:.3f} °C, least possible {idle.least_possible:.3f}, "
         f"idle valve {idle.mean_error:.3f}"

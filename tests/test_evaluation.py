@@ -24,52 +24,52 @@ def idle(observations):
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_each_has_an_id_of_its_own(name):
-    ids = [
+def test_each_preset_has_an_id(name):
+    environments = [
         gymnasium.make(IDS[name]),
         gymnasium.make("MiddlePoint-v0", **PRESETS[name]),
         gymnasium.make(EnvSpec.from_json(gymnasium.make(IDS[name]).spec.to_json())),
     ]
     batch = gymnasium.make_vec(IDS[name], num_envs=1)
-    assert {env.unwrapped.parameters for env in ids} == {batch.parameters}
-    assert {env.spec.max_episode_steps for env in ids} == {1200}
+    assert {env.unwrapped.parameters for env in environments} == {batch.parameters}
+    assert {env.spec.max_episode_steps for env in environments} == {1200}
 
 
 class TestEvaluate:
-    def test_it_is_a_mean_over_the_rewards_of_the_listed_seeds(self):
-        found = evaluate(PIController(), HARD, episodes=3)
-        assert list(found.seeds) == [SEED, SEED + 1, SEED + 2]
-        for i, seed in enumerate(found.seeds):
+    def test_errors_and_travels_are_those_of_the_seeds(self):
+        result = evaluate(PIController(), HARD, episodes=3)
+        assert list(result.seeds) == [SEED, SEED + 1, SEED + 2]
+        for i, seed in enumerate(result.seeds):
             infos = run(MiddlePointEnv(**PRESETS["hard"]), [PIController().act] * 1200, seed)
-            errors, travel = np.abs(infos["error"][1:]), np.abs(np.diff(infos["applied"]))
-            assert found.errors[i] == pytest.approx(errors.mean(), abs=1e-12)
-            assert found.travels[i] == pytest.approx(travel.sum(), abs=1e-9)
-        assert found.mean_error == pytest.approx(found.errors.mean(), abs=1e-12)
+            mean_error = np.abs(infos["error"][1:]).mean()
+            travel = np.abs(np.diff(infos["applied"])).sum()
+            assert result.errors[i] == pytest.approx(mean_error, abs=1e-12)
+            assert result.travels[i] == pytest.approx(travel, abs=1e-9)
+        assert result.mean_error == pytest.approx(result.errors.mean(), abs=1e-12)
 
     @pytest.mark.parametrize("name", ["paper", "hard"])
-    def test_a_valve_that_is_left_alone_scores_0_and_the_bound_1(self, name):
-        found = evaluate(idle, IDS[name], episodes=5)
-        assert found.score == pytest.approx(0.0, abs=1e-12)
-        assert found.scores == pytest.approx(np.zeros(5), abs=1e-12)
-        assert found.travel == 0.0
-        # The same line through both, at the error of a better policy.
+    def test_an_idle_valve_scores_0_and_the_bound_1(self, name):
+        result = evaluate(idle, IDS[name], episodes=5)
+        assert result.score == pytest.approx(0.0, abs=1e-12)
+        assert result.scores == pytest.approx(np.zeros(5), abs=1e-12)
+        assert result.travel == 0.0
+        # The score of another policy lies on the line through both points.
         better = evaluate(PIController(1.0, 0.05), IDS[name], episodes=5)
-        share = (found.mean_error - better.mean_error) / (
-            found.mean_error - found.least_possible
-        )
-        assert better.score == pytest.approx(share)
+        gained = result.mean_error - better.mean_error
+        possible = result.mean_error - result.least_possible
+        assert better.score == pytest.approx(gained / possible)
         assert better.interval[0] <= better.score <= better.interval[1]
         assert better.multiple == pytest.approx(better.mean_error / better.least_possible)
 
-    def test_the_interval_holds_what_more_episodes_say(self):
+    def test_the_interval_contains_the_score_of_more_episodes(self):
         few = evaluate(PIController(1.0, 0.05), HARD, episodes=40)
         more = evaluate(PIController(1.0, 0.05), HARD, episodes=120)
         assert few.interval[0] < more.score < few.interval[1]
-        # The last of 120, which are more than one batch.
+        # An episode does not depend on the episodes before it.
         last = evaluate(PIController(1.0, 0.05), HARD, episodes=20, seed=SEED + 100)
         np.testing.assert_array_equal(last.errors, more.errors[100:])
         np.testing.assert_array_equal(last.scores, more.scores[100:])
-        # The normal interval of a quotient of means, by its linear part.
+        # The interval of a quotient of two means, by the delta method.
         possible = (more.errors - more.least) / (1.0 - more.scores)
         linear = possible * (more.scores - more.score) / possible.mean()
         width = 2 * 1.96 * linear.std() / 120**0.5
@@ -77,61 +77,58 @@ class TestEvaluate:
         alike = evaluate(PIController(1.0, 0.05), episodes=10)
         assert np.ptp(alike.interval) == pytest.approx(0.0, abs=1e-12)
 
-    def test_other_episodes_and_lengths(self):
-        found = evaluate(PIController(), HARD, episodes=5, seed=3)
-        assert (found.score, found.interval, found.scores) == (None, None, None)
-        assert str(found).endswith(found.note)
-        for result, reason in (
-            (found, "kept for seeds 7,000,000 to 7,000,119.*, not for 3 to 7: choose"),
+    def test_without_a_bound_the_note_says_why(self):
+        other_seeds = evaluate(PIController(), HARD, episodes=5, seed=3)
+        assert other_seeds.seeds == range(3, 8)
+        assert str(other_seeds).endswith(other_seeds.note)
+        short = evaluate(idle, episodes=2, max_episode_steps=301)
+        assert short.mean_error == 5.0  # of the square wave at all samples but k = 0
+        for unscored, reason in (
+            (other_seeds, "kept for seeds 7,000,000 to 7,000,119.*, not for 3 to 7: choose"),
             (evaluate(idle, HARD, episodes=121), "not for 7,000,000 to 7,000,120: choose"),
-            (evaluate(idle, episodes=2, max_episode_steps=301), "1,200 samples, not of 301"),
+            (short, "1,200 samples, not of 301"),
             (evaluate(idle, episodes=2, delay=3), "presets alone, .* checkout, python -m ben"),
         ):
-            assert result.score is None
-            assert re.search(reason, result.note)
-        assert found.seeds == range(3, 8)
-        short = evaluate(idle, episodes=2, max_episode_steps=301)
-        # 300 samples at 5 degC but for k = 0, and at k = 300 the next half period begins.
-        assert short.mean_error == 5.0
-        assert short.score is None
+            assert (unscored.score, unscored.interval, unscored.scores) == (None, None, None)
+            assert re.search(reason, unscored.note)
 
     def test_a_score_without_travel_says_why(self):
-        found = evaluate(idle, "MiddlePointRandomised-v0", episodes=2)
-        assert found.score == 0.0
-        assert "no action left the dead zone of 3 to 7 t/h: train in mptc_gym.wr" in str(found)
+        result = evaluate(idle, "MiddlePointRandomised-v0", episodes=2)
+        assert result.score == 0.0
+        assert "no action left the dead zone of 3 to 7 t/h: train in mptc_gym.wr" in str(result)
         assert "dead zone of 5 t/h" in str(evaluate(idle, episodes=2))
         assert "the valve never moved" in evaluate(idle, episodes=2, dead_zone=0.0).note
         assert not evaluate(PIController(), episodes=2).note
 
     def test_help_explains_each_field(self):
         explained = re.findall(r"\n    ([\w, ]+) : ", Evaluation.__doc__)
-        fields = {each.name for each in dataclasses.fields(Evaluation)}
-        assert {*", ".join(explained).split(", ")} == fields
+        fields = [field.name for field in dataclasses.fields(Evaluation)]
+        assert sorted(", ".join(explained).split(", ")) == sorted(fields)
 
     def test_its_text_is_one_line(self):
-        found = evaluate(PIController(), HARD, episodes=4)
-        assert f"{HARD}: mean error {found.mean_error:.3f} degC" in str(found)
-        assert f"score {found.score:.3f} (95 % " in str(found)
-        assert "\n" not in str(found)
+        result = evaluate(PIController(), HARD, episodes=4)
+        assert f"{HARD}: mean error {result.mean_error:.3f} degC" in str(result)
+        assert f"score {result.score:.3f} (95 % " in str(result)
+        assert "\n" not in str(result)
         same = str(evaluate(idle, episodes=2))  # an interval of no width would mean nothing
         assert "score 0.000; valve travel 0 t/h; 2 episodes, all alike" in same
 
 
 class TestBounds:
     @pytest.mark.parametrize("name", [*CASES][::3])
-    def test_they_are_those_of_the_limits(self, name):
+    def test_they_are_the_computed_bounds(self, name):
         plant = Parameters(**CASES[name])
-        kept = find_bound(plant, 1200, range(SEED, SEED + 120)).least
-        drawn = bool(plant.ranges) or plant.setpoint == "random"
-        assert len(set(kept.tolist())) == (120 if drawn else 1)
-        i = 118 if drawn else 0
+        stored = find_bound(plant, 1200, range(SEED, SEED + 120)).least
+        differs = bool(plant.ranges) or plant.setpoint == "random"
+        assert len(set(stored.tolist())) == (120 if differs else 1)
+        i = 118 if differs else 0
         least = least_possible(samples=1200, episodes=1, seed=SEED + i, **CASES[name])
-        assert kept[i] == pytest.approx(least.value, abs=2e-6)
+        assert stored[i] == pytest.approx(least.value, abs=2e-6)
 
-    def test_a_second_set_of_seeds_has_its_own(self, monkeypatch, tmp_path):
-        kept = json.loads((ROOT / "mptc_gym/bounds.json").read_text(encoding="utf-8"))
-        kept["cases"]["hard"]["validation_least"] = [0.5 + i for i in range(200)]
-        (tmp_path / "bounds.json").write_text(json.dumps(kept), encoding="utf-8")
+    def test_validation_seeds_have_bounds_of_their_own(self, monkeypatch, tmp_path):
+        stored = json.loads((ROOT / "mptc_gym/bounds.json").read_text(encoding="utf-8"))
+        stored["cases"]["hard"]["validation_least"] = [0.5 + i for i in range(200)]
+        (tmp_path / "bounds.json").write_text(json.dumps(stored), encoding="utf-8")
         monkeypatch.setattr(evaluation.resources, "files", lambda _: tmp_path)
         evaluation._read_bounds.cache_clear()
         hard = Parameters(**PRESETS["hard"])
@@ -145,15 +142,15 @@ class TestBounds:
             evaluation._read_bounds.cache_clear()
 
     def test_they_say_how_they_were_made(self):
-        kept = json.loads((ROOT / "mptc_gym/bounds.json").read_text(encoding="utf-8"))
-        assert {name: case["arguments"] for name, case in kept["cases"].items()} == CASES
-        assert (kept["samples"], kept["seed"], kept["episodes"]) == (1200, SEED, 120)
-        assert set(kept) >= {"command", "commit", "versions", "unit"}
+        stored = json.loads((ROOT / "mptc_gym/bounds.json").read_text(encoding="utf-8"))
+        assert {name: case["arguments"] for name, case in stored["cases"].items()} == CASES
+        assert (stored["samples"], stored["seed"], stored["episodes"]) == (1200, SEED, 120)
+        assert set(stored) >= {"command", "commit", "versions", "unit"}
 
-    def test_what_an_agent_sees_and_is_paid_changes_no_bound(self):
-        seen = evaluate(idle, episodes=2, action_window=9, reward="absolute", move_weight=0.1)
-        assert seen.least_possible == evaluate(idle, episodes=2).least_possible
-        # A case is known by its arguments, not by its name.
-        noisy = evaluate(idle, episodes=2, noise_variance=0.5)
-        assert noisy.score is not None
+    def test_windows_and_rewards_change_no_bound(self):
+        other = evaluate(idle, episodes=2, action_window=9, reward="absolute", move_weight=0.1)
+        assert other.least_possible == evaluate(idle, episodes=2).least_possible
+
+    def test_a_case_is_found_by_its_arguments(self):
+        assert evaluate(idle, episodes=2, noise_variance=0.5).score is not None
         assert evaluate(idle, episodes=2, noise_variance=0.6).score is None

@@ -20,24 +20,25 @@ from stable_baselines3.common.vec_env import (
 )
 
 from mptc_gym import MiddlePointEnv, evaluate
-from mptc_gym import sb3 as ours
 from mptc_gym.evaluation import VALIDATION_SEED
-from mptc_gym.sb3 import ScoreCallback, load, make_vec_env, save, spec_of
+from mptc_gym.sb3 import GymnasiumVecEnv, ScoreCallback, load, make_vec_env, save, spec_of
 from mptc_gym.sb3.models import SPEC_FILE
 from mptc_gym.wrappers import IncrementalAction
 
 HARD = "MiddlePointHard-v0"
-VELOCITY = {"max_move": 0.3, "compensate_dead_zone": True}
+INCREMENTS = {"max_move": 0.3, "compensate_dead_zone": True}
 TRAINING = {"action_window": 20, "setpoint": "random", "reward": "absolute"}
 SHORT = {"setpoint": "random", "setpoint_period": 20, "max_episode_steps": 30}
-TWO = [(3, {"noise_variance": 0.5, **SHORT}), (1, SHORT)]
+# Numbers and arguments of the plants in two batches.
+TWO_KINDS = [(3, {"noise_variance": 0.5, **SHORT}), (1, SHORT)]
 
 
 def two_batches(mode="SameStep"):
-    return ours.GymnasiumVecEnv(*(
-        gymnasium.make_vec("MiddlePoint-v0", n, autoreset_mode=mode, **given)
-        for n, given in TWO
-    ))  # fmt: skip
+    batches = [
+        gymnasium.make_vec("MiddlePoint-v0", n, autoreset_mode=mode, **arguments)
+        for n, arguments in TWO_KINDS
+    ]
+    return GymnasiumVecEnv(*batches)
 
 
 def one(**arguments):
@@ -54,39 +55,40 @@ class TestBatches:
     def test_they_equal_dummy_vec_env(self, kind, rng):
         if kind == "two":
             batch = two_batches()
-            made = [partial(one, **given) for n, given in TWO for _ in range(n)]
+            makers = [partial(one, **arguments) for n, arguments in TWO_KINDS for _ in range(n)]
         else:
-            given = {**TRAINING, "max_episode_steps": 7}
-            batch = make_vec_env(
-                HARD, 4, wrapper=partial(IncrementalAction, **VELOCITY), **given
-            )
-            made = [lambda: IncrementalAction(gymnasium.make(HARD, **given), **VELOCITY)] * 4
-        theirs = DummyVecEnv([lambda make=make: Monitor(make()) for make in made])
-        for each in (batch, theirs):
-            each.seed(3)
+            arguments = {**TRAINING, "max_episode_steps": 7}
+            wrapper = partial(IncrementalAction, **INCREMENTS)
+            batch = make_vec_env(HARD, 4, wrapper=wrapper, **arguments)
+            makers = [lambda: wrapper(gymnasium.make(HARD, **arguments))] * 4
+        dummy = DummyVecEnv([lambda make=make: Monitor(make()) for make in makers])
+        batch.seed(3)
+        dummy.seed(3)
         for name in ("num_envs", "observation_space", "action_space"):
-            assert getattr(batch, name) == getattr(theirs, name)
+            assert getattr(batch, name) == getattr(dummy, name)
         ends = 0
         for _ in range(2):
-            np.testing.assert_array_equal(batch.reset(), theirs.reset())
+            np.testing.assert_array_equal(batch.reset(), dummy.reset())
             for _ in range(70):
                 actions = rng.normal(0, 1, (4, 1)).astype(np.float32)
                 *arrays, infos = batch.step(actions)
-                *expected, expected_infos = theirs.step(actions)
-                for array, other in zip(arrays, expected, strict=True):
-                    np.testing.assert_array_equal(array, other)
-                    assert array.dtype == other.dtype
-                for info, other, done in zip(infos, expected_infos, arrays[2], strict=True):
-                    assert bool(info) == done
-                    if done:
-                        own, its = info.pop("episode"), other.pop("episode")
-                        assert own == {"r": pytest.approx(its["r"], abs=2e-6), "l": its["l"]}
-                        assert data_equivalence(info, other, exact=True)
-                        ends += 1
-                assert batch.reset_infos == theirs.reset_infos
+                *expected_arrays, expected_infos = dummy.step(actions)
+                for array, expected in zip(arrays, expected_arrays, strict=True):
+                    np.testing.assert_array_equal(array, expected)
+                    assert array.dtype == expected.dtype
+                ended = arrays[2]
+                assert [bool(info) for info in infos] == ended.tolist()
+                for i in np.flatnonzero(ended):
+                    episode = infos[i].pop("episode")
+                    expected = expected_infos[i].pop("episode")
+                    assert episode["r"] == pytest.approx(expected["r"], abs=2e-6)
+                    assert episode["l"] == expected["l"]
+                    assert data_equivalence(infos[i], expected_infos[i], exact=True)
+                ends += ended.sum()
+                assert batch.reset_infos == dummy.reset_infos
         assert ends >= 16
 
-    def test_a_group_draws_the_same_and_no_other_does(self, rng):
+    def test_only_plants_of_a_group_have_the_same_random_numbers(self, rng):
         plants = make_vec_env(HARD, 6, seed=3, group=3)
         apart = make_vec_env(HARD, 2, seed=3)
         for _ in range(2):  # of the seed, and of what follows it
@@ -96,7 +98,7 @@ class TestBatches:
             plants.step(rng.normal(0, 1, (6, 1)))
             assert len(np.unique(plants.infos["noise"])) == 2
 
-    def test_what_they_show_and_what_they_refuse(self):
+    def test_attributes_and_pictures_are_those_of_the_batches(self):
         pictured = make_vec_env("MiddlePoint-v0", 2, render_mode="rgb_array")
         pictured.reset()
         np.testing.assert_array_equal(pictured.get_images(), pictured.batches[0].render())
@@ -128,24 +130,25 @@ class TestBatches:
 
 class TestZips:
     def test_a_model_comes_back_with_environments_like_its_own(self, tmp_path):
-        plants = make_vec_env(HARD, 3, wrapper=VELOCITY, action_window=4, max_episode_steps=9)
+        plants = make_vec_env(HARD, 3, wrapper=INCREMENTS, action_window=4, max_episode_steps=9)
         model = model_of(plants)
         save(model, tmp_path / "model")
-        assert [each.name for each in tmp_path.iterdir()] == ["model.zip"]
+        assert [file.name for file in tmp_path.iterdir()] == ["model.zip"]
         loaded = load(tmp_path / "model", device="cpu")
         assert loaded.get_env().num_envs == 3
         assert loaded.get_env().get_attr("spec")[0].max_episode_steps == 9
         assert spec_of(loaded, HARD) == spec_of(model, HARD)
         # It is a zip of Stable-Baselines3 all the same.
-        bare, seen = PPO.load(tmp_path / "model.zip", device="cpu"), np.ones((1, 10), "f4")
-        actions = [m.predict(seen, deterministic=True)[0] for m in (loaded, bare, model)]
+        bare = PPO.load(tmp_path / "model.zip", device="cpu")
+        observation = np.ones((1, 10), np.float32)
+        actions = [m.predict(observation, deterministic=True)[0] for m in (loaded, bare, model)]
         assert actions[0] == actions[1] == actions[2]
         loaded.learn(64)
 
     def test_a_name_stays_as_it_is_and_one_that_is_too_long_is_refused(self, tmp_path):
         save(model := model_of(make_vec_env()), tmp_path / "model.step8")
         (tmp_path / "other").touch()
-        modes = {each.name: each.stat().st_mode for each in tmp_path.iterdir()}
+        modes = {file.name: file.stat().st_mode for file in tmp_path.iterdir()}
         assert modes["model.step8"] == modes["other"]
         with pytest.raises(ValueError, match="cannot be written: File name too long"):
             save(model, tmp_path / ("m" * 300))
@@ -168,7 +171,7 @@ class TestZips:
             (lambda: type("Local", (DelayObservation,), {})(one(), 2), "can be imported"),
         ],
     )
-    def test_what_cannot_be_saved_is_said_also_before_training(self, make, message, tmp_path):
+    def test_what_cannot_be_saved_is_refused_before_a_training(self, make, message, tmp_path):
         model = model_of(make())
         with pytest.raises(ValueError, match=message):
             save(model, tmp_path / "model.zip")
@@ -178,7 +181,7 @@ class TestZips:
         assert not [*tmp_path.iterdir()]
 
     def test_damaged_and_other_zips_are_refused(self, tmp_path):
-        model, file = model_of(make_vec_env(wrapper=VELOCITY)), tmp_path / "model.zip"
+        model, file = model_of(make_vec_env(wrapper=INCREMENTS)), tmp_path / "model.zip"
         save(model, file)
         with zipfile.ZipFile(file) as archive:
             record = archive.read(SPEC_FILE).decode()
@@ -203,7 +206,7 @@ class TestZips:
 
 
 def test_spec_of_a_model_has_its_windows_and_wrappers():
-    model = model_of(make_vec_env("MiddlePoint-v0", 2, wrapper=VELOCITY, **TRAINING))
+    model = model_of(make_vec_env("MiddlePoint-v0", 2, wrapper=INCREMENTS, **TRAINING))
     other = DelayObservation(gymnasium.make(HARD, output_window=2), 3).spec
     for env in (HARD, other):
         env = gymnasium.make(spec_of(model, env, delay=3))
@@ -221,8 +224,8 @@ def test_spec_of_a_model_has_its_windows_and_wrappers():
 
 
 class TestScoreCallback:
-    def test_it_scores_keeps_the_best_and_tells(self, tmp_path, capsys):
-        plants = make_vec_env("MiddlePoint-v0", 2, seed=0, wrapper=VELOCITY, **TRAINING)
+    def test_it_records_scores_and_keeps_the_best_policy(self, tmp_path, capsys):
+        plants = make_vec_env("MiddlePoint-v0", 2, seed=0, wrapper=INCREMENTS, **TRAINING)
         noisy, best = "MiddlePointNoisy-v0", tmp_path / "best.zip"
         callback = ScoreCallback(noisy, every=128, episodes=3, path=best)
         model = model_of(plants, seed=2, learning_rate=0.01)  # gets worse
@@ -230,11 +233,11 @@ class TestScoreCallback:
         model.learn(192, callback=callback)
         model.logger.close()
         assert [samples for samples, _ in callback.scores] == [128, 192]
-        errors = [found.mean_error for _, found in callback.scores]
+        errors = [evaluation.mean_error for _, evaluation in callback.scores]
         assert callback.best.mean_error == min(errors)
         kept = load(best, device="cpu")
-        found = evaluate(kept, spec_of(kept, noisy), episodes=3, seed=VALIDATION_SEED)
-        assert found.mean_error == min(errors)
+        again = evaluate(kept, spec_of(kept, noisy), episodes=3, seed=VALIDATION_SEED)
+        assert again.mean_error == min(errors)
         shown = capsys.readouterr().out.splitlines()
         assert shown[0].startswith(f"128 of 192 samples: {noisy}: mean error ")
         least = np.minimum.accumulate([np.inf, *errors])[:-1]
@@ -257,8 +260,8 @@ class TestScoreCallback:
         before = vars(copy.deepcopy(separate.obs_rms))
         callback = ScoreCallback(separate, every=64, episodes=2, verbose=0)
         model.learn(64, callback)
-        found = evaluate(model, model.get_env(), episodes=2, seed=VALIDATION_SEED)
-        assert found.mean_error == callback.best.mean_error
+        again = evaluate(model, model.get_env(), episodes=2, seed=VALIDATION_SEED)
+        assert again.mean_error == callback.best.mean_error
         for name, value in vars(separate.obs_rms).items():
             np.testing.assert_array_equal(value, before[name])
 
@@ -275,7 +278,7 @@ class TestScoreCallback:
         for scored, plain in zip(weights(True), weights(False), strict=True):
             np.testing.assert_array_equal(scored, plain)
 
-    def test_it_overwrites_no_file_of_anybody(self, tmp_path):
+    def test_it_overwrites_no_file_but_its_own(self, tmp_path):
         best, hidden = tmp_path / "best.zip", tmp_path / ".best.zip"
         hidden.write_text("a user's")
         made = partial(make_vec_env, max_episode_steps=5)
@@ -290,7 +293,7 @@ class TestScoreCallback:
         assert hidden.read_text() == "a user's"
         assert {*tmp_path.iterdir()} == {best, hidden}
 
-    def test_it_refuses_what_it_cannot_judge(self, tmp_path):
+    def test_it_refuses_what_cannot_be_scored(self, tmp_path):
         with pytest.raises(ValueError, match="every must be an integer from 1"):
             ScoreCallback(every=0)
         with pytest.raises(ValueError, match="zip cannot be written: No such file"):

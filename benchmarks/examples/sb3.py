@@ -1,8 +1,7 @@
 """Train PPO of Stable-Baselines3 to control the plant, in a quarter of a minute on one core.
 
 `python benchmarks/examples/sb3.py` trains a policy, saves the policy in `ppo-0.zip`, and prints
-its scores. A score of 0 is that of an idle valve, and a score of 1 means the least possible
-error.
+its scores. The score of an idle valve is 0, and the score of the least possible error is 1.
 
 This file can be copied without any other file; `benchmarks/train/ppo.py` imports it. The
 training works for the following reasons:
@@ -79,14 +78,14 @@ def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
     """
     setpoints, errors, outputs, actions = observations.split([*windows.values()], dim=1)
     scaled_changes = [
-        0.2 * changes(setpoints, 3),
-        0.5 * changes(outputs, 8),
-        changes(actions, 30),
+        0.2 * changes(setpoints, short_stretches=3),
+        0.5 * changes(outputs, short_stretches=8),
+        changes(actions, short_stretches=30),
     ]
     return torch.cat([errors, *scaled_changes], dim=1)
 
 
-def changes(window: Tensor, single: int) -> Tensor:
+def changes(window: Tensor, short_stretches: int) -> Tensor:
     """Return the changes of a signal between successive stretches of its past.
 
     A change is the mean over a stretch minus the mean over the next older stretch.
@@ -95,7 +94,7 @@ def changes(window: Tensor, single: int) -> Tensor:
     ----------
     window
         Past samples of a signal for n plants, newest first, shape (n, length).
-    single
+    short_stretches
         Number of newest stretches that are one sample long. The older stretches have 2, 4, 8
         samples and so on, and the oldest stretch has the remaining samples.
 
@@ -104,11 +103,11 @@ def changes(window: Tensor, single: int) -> Tensor:
     Tensor
         The changes, newest first, shape (n, stretches - 1).
     """
-    lengths = [1] * single
+    lengths = [1] * short_stretches
     while remaining := window.shape[1] - sum(lengths):
         lengths.append(min(2 * lengths[-1], remaining))
-    means = [stretch.mean(1) for stretch in window.split(lengths, 1)]
-    return -torch.stack(means, 1).diff()
+    means = [stretch.mean(dim=1) for stretch in window.split(lengths, dim=1)]
+    return -torch.stack(means, dim=1).diff()  # `diff` is the older mean minus the newer mean
 
 
 class Changes(BaseFeaturesExtractor):

@@ -69,17 +69,17 @@ class Curve(BaseCallback):
         self._labels = labels
         self._path = path
         self._due_times = [seconds * point / SCORES for point in range(1, SCORES + 1)]
-        self._start_time = time.process_time()
+        self._start = time.process_time()
         self._scoring_seconds = 0.0  # processor time of all scores so far
 
     def _on_step(self) -> bool:
         """Score the policy if a score is due; return whether another score is to come."""
-        training_seconds = time.process_time() - self._start_time - self._scoring_seconds
+        training_seconds = time.process_time() - self._start - self._scoring_seconds
         if training_seconds >= self._due_times[0]:
             del self._due_times[0]
-            before = time.process_time()
+            score_start = time.process_time()
             self._append_score(training_seconds)
-            self._scoring_seconds += time.process_time() - before
+            self._scoring_seconds += time.process_time() - score_start
         return bool(self._due_times)
 
     def _append_score(self, training_seconds: float) -> None:
@@ -128,8 +128,7 @@ def main() -> None:
     )
     labels = {"algorithm": options.algorithm, "seed": options.seed}
     curve = Curve(60.0 * options.minutes, labels, options.out)
-    no_limit = 10**9  # samples of experience: the callback ends the training
-    model.learn(no_limit, callback=curve)
+    model.learn(total_timesteps=10**9, callback=curve)  # the callback ends the training earlier
 
 
 if __name__ == "__main__":

@@ -53,12 +53,13 @@ class GymnasiumVecEnv(VecEnv):
         self.spec = spec
         self.group = group
         self.infos: dict[str, Any] = {}
-        self._slices: list[slice] = []  # of the numbers of each batch's environments
+        self._slices: list[slice] = []  # for each batch, the numbers of its environments
         num_envs = 0
         for batch in batches:
             self._slices.append(slice(num_envs, num_envs + batch.num_envs))
             num_envs += batch.num_envs
-        self._next_seeds: list[int | None] = [None] * num_envs  # None: no new seed
+        # The seed of each environment at the next reset; None continues the random numbers.
+        self._next_seeds: list[int | None] = [None] * num_envs
         # Sum of rewards and number of samples in the present episode of each environment.
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, np.int64)
@@ -86,19 +87,18 @@ class GymnasiumVecEnv(VecEnv):
         If neither `seed` nor `set_seeds` has set seeds since the latest reset, the sequences of
         random numbers continue.
         """
-        returned = [
-            batch.reset(seed=self._next_seeds[numbers])
-            for batch, numbers in zip(self.batches, self._slices, strict=True)
-        ]
+        observations = []
+        batch_infos = []
+        self.reset_infos = []
+        for batch, numbers in zip(self.batches, self._slices, strict=True):
+            observations_of_batch, infos = batch.reset(seed=self._next_seeds[numbers])
+            observations.append(observations_of_batch)
+            batch_infos.append(infos)
+            self.reset_infos += [_infos_of_one(infos, row) for row in range(batch.num_envs)]
+        self.infos = _joined(batch_infos)
         self._next_seeds = [None] * self.num_envs
         self._returns[:] = 0.0
         self._lengths[:] = 0
-        observations, infos = zip(*returned, strict=True)  # each has an element for each batch
-        self.infos = _joined(infos)
-        self.reset_infos = []
-        for infos_of_batch, batch in zip(infos, self.batches, strict=True):
-            rows = range(batch.num_envs)
-            self.reset_infos += [_infos_of_one(infos_of_batch, row) for row in rows]
         return np.concatenate(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -125,7 +125,7 @@ class GymnasiumVecEnv(VecEnv):
             batch.step(self._actions[numbers])
             for batch, numbers in zip(self.batches, self._slices, strict=True)
         ]
-        # Each array of a batch is joined with the arrays of other batches.
+        # `zip` collects the observations of all batches, the rewards of all batches, and so on.
         *arrays, batch_infos = zip(*returned, strict=True)
         observations, rewards, terminated, truncated = map(np.concatenate, arrays)
         self.infos = _joined(batch_infos)

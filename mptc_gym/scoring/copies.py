@@ -78,8 +78,8 @@ class Copy:
             return self._copies[id(layer)]
         copies_of_inner = [self._copy(inner) for inner in inner_environments(layer)]
         if isinstance(layer, tuple(map(loaded, _RECORDERS))):
-            self._copies[id(layer)] = copies_of_inner[0]
-            return copies_of_inner[0]
+            self._copies[id(layer)] = copies_of_inner[0]  # a recorder wraps one environment
+            return self._copies[id(layer)]
         reason = _why_not_copied(layer)
         if not reason:
             copies_before = dict(self._copies)
@@ -116,10 +116,11 @@ class Copy:
         attributes = dict(vars(wrapper))
         if "results_writer" in attributes:
             attributes["results_writer"] = None  # so that the copy of a monitor writes no file
-        if "class_attributes" in attributes:  # of a VecEnvWrapper; what is in it has no copies
+        if "class_attributes" in attributes:
+            # A VecEnvWrapper has these from its class, so the copy has them, too.
             class_attributes = attributes["class_attributes"]
             self._copies[id(class_attributes)] = class_attributes
-        # The inner environments come first: a wrapper looks in them for what it lacks itself.
+        # The inner environments come first: a wrapper takes attributes that it lacks from them.
         inner_names = [name for name in INNER if name in attributes]
         for name in [*inner_names, *attributes]:
             vars(duplicate)[name] = copy.deepcopy(attributes[name], self._copies)

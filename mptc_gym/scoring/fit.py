@@ -1,7 +1,7 @@
 """Refuse environments that a policy was not trained or made for, as far as this is known.
 
-A model of Stable-Baselines3 and a controller in `agents` know something of their environments;
-a function knows nothing.
+A model of Stable-Baselines3 stores the spaces of its training, and a controller in `agents`
+stores the actuator that it was made for. A function stores neither.
 """
 
 from __future__ import annotations
@@ -74,6 +74,7 @@ def _check_statistics(normaliser: Any) -> None:
     """
     # A wrapper of rewards alone has no statistics of observations.
     statistics = vars(normaliser).get("obs_rms", {})
+    # Of dict observations, a VecNormalize has statistics for each part.
     parts = statistics.values() if isinstance(statistics, dict) else [statistics]
     for part in parts:
         if not part.mean.any() and (part.var == 1.0).all():

@@ -197,8 +197,8 @@ def _refuse_training_environments(copy: Copy, target: Any) -> None:
 def _next_seeds(plants: Plants) -> list[int]:
     """Return a seed for a new episode of each plant, computed from the present seeds.
 
-    With these seeds, the environments of a user do not go on with the episodes of a score. The
-    seeds are not random, so that a user can repeat a program.
+    Without new seeds, a user's environments would continue the random numbers of the scored
+    episodes. The new seeds are not random, so that a user can repeat a program.
     """
     present_seeds = np.ravel(plants.unwrapped.np_random_seed).tolist()
     # A SeedSequence takes no negative number, which is Gymnasium's value for an unknown seed.

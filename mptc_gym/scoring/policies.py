@@ -41,9 +41,9 @@ class Form(NamedTuple):
 
 
 def form_of(policy: Any) -> Form:
-    """Return how a policy is called, and on which object.
+    """Return how a policy of any form that `evaluate` takes is called, and on which object.
 
-    A ValueError is raised if the policy has none of the four forms.
+    A ValueError is raised if the policy has none of these forms.
     """
     if is_environment(policy):
         reject("policy", policy, "a policy, which comes first: evaluate(policy, env)")
@@ -51,14 +51,14 @@ def form_of(policy: Any) -> Form:
         reject("policy", policy, "an object with predict or act, not a class")
     function = policy
     while isinstance(function, partial):
-        function = function.func
+        function = function.func  # the function within the partial
     owner = getattr(function, "__self__", function)  # the object of a bound method
     module = owner if isinstance(owner, loaded("torch.nn.Module")) else None
     for method in _METHODS:
         if callable(getattr(policy, method, None)):
             return Form(getattr(policy, method), method, policy, module)
     name = getattr(function, "__name__", "")
-    if name in _METHODS and owner is not function:
+    if name in _METHODS and owner is not function:  # a bound method `predict` or `act`
         return Form(policy, name, owner, module)
     if not callable(policy):
         allowed = "a function, a torch.nn.Module, or an object with predict or act"
@@ -95,13 +95,12 @@ def _act_by_predict(predict: Callable[..., Any], n: int) -> Act:
     the keywords `state`, `episode_start` and `deterministic=True`, without keywords that it
     does not take, and without keywords that a `functools.partial` has set.
     """
-    parameters = inspect.signature(predict).parameters.values()
-    names = {parameter.name for parameter in parameters}
-    takes_any_keyword = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    parameters = inspect.signature(predict).parameters
+    takes_any_keyword = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     set_by_partial = predict.keywords if isinstance(predict, partial) else {}
     keywords = {"state": None, "episode_start": np.ones(n, np.bool_), "deterministic": True}
     for name in [*keywords]:
-        if name in set_by_partial or not (takes_any_keyword or name in names):
+        if name in set_by_partial or not (takes_any_keyword or name in parameters):
             del keywords[name]
 
     def act(observations: Any) -> Any:
