@@ -280,9 +280,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return self._plants.numbers.chosen(self.parameters.ranges), load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Start new random number streams of the plants in `mask` that `seed` gives a seed.
+        """Restart the random number streams of the plants in `mask`, each from its own seed.
 
-        At the first reset, plants without a seed get a random seed.
+        `seed` is the argument of `reset`. The streams of plants without a seed continue, or
+        start from a random seed at the first reset.
         """
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():

@@ -63,7 +63,7 @@ class TorchPlants:
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
-        """Prepare plants whose numbers, such as delay and dead zone, `episodes` hold."""
+        """Prepare the plants; `episodes` holds delays, dead zones and other plant numbers."""
         self._episodes = episodes
         self._zeros = episodes.zeros
         self._dynamics = Dynamics(parameters)
