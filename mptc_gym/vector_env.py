@@ -202,7 +202,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         """Return the rewards of errors e(k+1), degC, and actions a(k), all of shape (n,)."""
         rewards: Values = error / self._error_scale
         if self.parameters.reward == "quadratic":
-            rewards *= rewards  # the paper's cost, equation (12), scaled and negated
+            # The paper's cost, equation (12), scaled and negated.
+            rewards *= rewards
             rewards *= self._minus_half
         else:
             rewards = -np.abs(rewards)

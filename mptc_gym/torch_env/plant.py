@@ -155,8 +155,8 @@ class TorchPlants:
         The results are the commanded flows u(k) and the applied flows u_a(k), t/h, shape (n,).
         """
         u_min, u_max = self._limits
-        # Last formula of the paper's Section 4. In float64, rounding is that of NumPy; in
-        # float32, speed counts more.
+        # Actions from -1 to 1 command flows from u_min to u_max (last formula of the paper's
+        # Section 4). In float64, rounding is that of NumPy; in float32, speed counts more.
         if actions.dtype == torch.float64:
             command = actions.add(1.0).mul_(self._half_range).add_(u_min)
         else:

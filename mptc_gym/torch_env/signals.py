@@ -155,6 +155,7 @@ class Disturbance:
     """
 
     def __init__(self, episodes: Episodes) -> None:
+        """Begin with a load of 0; `episodes` holds plant numbers and generator."""
         self._episodes = episodes
         # The two parts of the load, steps and walk, degC.
         self._steps = History(episodes.zeros, 1)
