@@ -202,7 +202,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         """Return the rewards of errors e(k+1), degC, and actions a(k), all of shape (n,)."""
         rewards: Values = error / self._error_scale
         if self.parameters.reward == "quadratic":
-            rewards *= rewards  # the paper's cost, equation (12), scaled and negated
+            # The paper's cost, equation (12), scaled and negated.
+            rewards *= rewards
             rewards *= self._minus_half
         else:
             rewards = -np.abs(rewards)
@@ -280,9 +281,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return self._plants.numbers.select(self.parameters.ranges), load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Start new random number streams of the plants in `mask` that `seed` gives a seed.
+        """Restart the random number streams of the plants in `mask`, each from its own seed.
 
-        At the first reset, plants without a seed get a random seed.
+        `seed` is the argument of `reset`. The streams of plants without a seed continue, or
+        start from a random seed at the first reset.
         """
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():

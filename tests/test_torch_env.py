@@ -30,22 +30,22 @@ def make(num_envs=2, **arguments):
     return MiddlePointTorchEnv(num_envs, **{"dtype": torch.float64, **arguments})
 
 
-def met(envs, seed, *, episodes, samples):
-    """Return what the plants of an environment in NumPy meet, to be handed in."""
+def signals_of(envs, seed, *, episodes, samples):
+    """Return signals and plant numbers of an environment in NumPy, as external signals."""
     parameters, n = envs.parameters, envs.num_envs
-    signals, sampler = Signals.of(parameters, n, samples), PlantSampler(parameters)
+    signals, ranges = Signals.of(parameters, n, samples), PlantSampler(parameters)
     streams = [RandomStreams.of_seed(seed + i) for i in range(n)]
-    found = defaultdict(list)
+    values_by_name = defaultdict(list)
     for _ in range(episodes):
         numbers = sampler.sample(streams)
         first = {"setpoint": signals.reset(np.arange(n), streams, numbers)}
         for name, signal in signals._asdict().items():
             if signal is not None:
                 rows = [signal.next().copy() for _ in range(samples)]
-                found[name].append([first.get(name, np.zeros(n)), *rows])
+                values_by_name[name].append([first.get(name, np.zeros(n)), *rows])
         for name, values in numbers.select(parameters.ranges).items():
-            found[name].append(values)
-    return {name: torch.tensor(np.array(values)) for name, values in found.items()}
+            values_by_name[name].append(values)
+    return {name: torch.tensor(np.array(values)) for name, values in values_by_name.items()}
 
 
 def assert_close(ours, theirs, name, rtol, atol):
@@ -69,7 +69,7 @@ def assert_close(ours, theirs, name, rtol, atol):
 
 
 def compare(env, envs, *, steps, rng, partial_resets, limit, rtol=1e-9, atol=1e-9):
-    """Let the environment in PyTorch meet the same as that in NumPy."""
+    """Compare both environments on the same signals and actions."""
 
     def checked(ours, theirs):
         for own, other in zip(ours, theirs, strict=True):
@@ -80,7 +80,7 @@ def compare(env, envs, *, steps, rng, partial_resets, limit, rtol=1e-9, atol=1e-
     masks = rng.random((steps, n)) < partial_resets
     limit = steps if limit is None else limit
     episodes = 2 + masks.sum(axis=0).max() + steps // limit
-    signals = met(envs, seed, episodes=episodes, samples=min(limit, steps))
+    signals = signals_of(envs, seed, episodes=episodes, samples=min(limit, steps))
     checked(env.reset(options={"signals": signals}), envs.reset(seed=seed))
     for mask in masks:
         actions = random_actions(rng, n)
@@ -118,11 +118,11 @@ def test_it_equals_the_environment_in_numpy(
     ("dtype", "rtol", "atol"), [(torch.float64, 1e-9, 1e-9), (torch.float32, 1e-5, 1e-4)]
 )
 def test_it_equals_it_over_long_episodes_in_both_types(dtype, rtol, atol, rng):
-    shown = {"action_window": 20, "output_window": 2, "move_weight": 0.1, **PRESETS["hard"]}
-    arguments = {"max_episode_steps": 400, "autoreset_mode": "SameStep", **shown}
+    plant = {"action_window": 20, "output_window": 2, "move_weight": 0.1, **PRESETS["hard"]}
+    arguments = {"max_episode_steps": 400, "autoreset_mode": "SameStep", **plant}
     env, envs = make(3, dtype=dtype, **arguments), MiddlePointVectorEnv(3, **arguments)
-    of = {"rtol": rtol, "atol": atol}
-    compare(env, envs, steps=600, rng=rng, partial_resets=0.002, limit=400, **of)
+    tolerances = {"rtol": rtol, "atol": atol}
+    compare(env, envs, steps=600, rng=rng, partial_resets=0.002, limit=400, **tolerances)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -152,8 +152,8 @@ class TestGradients:
         def returned(actions):
             env.reset(seed=0)
             steps = [env.step(a) for a in actions]
-            found = [(seen, reward, infos["output"]) for seen, reward, *_, infos in steps]
-            return tuple(torch.stack(each) for each in zip(*found, strict=True))
+            samples = [(seen, reward, infos["output"]) for seen, reward, *_, infos in steps]
+            return tuple(torch.stack(column) for column in zip(*samples, strict=True))
 
         # Well inside what the actuator passes, and far from the same action twice.
         size = torch.linspace(0.55, 0.8, 24, dtype=torch.float64).reshape(12, 2, 1)
@@ -300,9 +300,9 @@ def test_signals_end_with_an_error_and_with_a_reset_without():
 def test_after_the_last_given_episode_the_first_follows_again():
     env = make(1, max_episode_steps=2)
     levels = torch.tensor([1.0, 2.0])[:, None, None].expand(2, 3, 1)  # episodes, samples, n
-    found = [env.reset(options={"signals": {"setpoint": levels}})[1]["setpoint"].item()]
-    found += [env.step(torch.zeros(1, 1))[-1]["setpoint"].item() for _ in range(11)]
-    assert found == [1.0] * 3 + [2.0] * 3 + [1.0] * 3 + [2.0] * 3
+    setpoints = [env.reset(options={"signals": {"setpoint": levels}})[1]["setpoint"].item()]
+    setpoints += [env.step(torch.zeros(1, 1))[-1]["setpoint"].item() for _ in range(11)]
+    assert setpoints == [1.0] * 3 + [2.0] * 3 + [1.0] * 3 + [2.0] * 3
 
 
 class TestById:

@@ -223,8 +223,8 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         mask
             The plants.
         infos
-            The infos of a step, or an empty dict. In this dict, which is also returned, the
-            elements of other plants stay the same.
+            The infos of a step, or an empty dict, filled in place and returned. The elements of
+            plants outside `mask` stay the same.
         """
         self._starts[mask] = self._clock
         self._next_end = int(self._starts.min()) + self._episode_length
@@ -289,7 +289,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
 
     @abstractmethod
     def _hidden_state(self) -> tuple[dict[str, Array], Array]:
-        """Return what no observation shows, for `plant_state`, in arrays of shape (num_envs,).
+        """Return the plant numbers and loads that `plant_state` needs, shape (num_envs,).
 
         Returns
         -------

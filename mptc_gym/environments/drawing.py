@@ -126,7 +126,7 @@ class Panel:
         self._surface.fill(colour, area, pygame.BLEND_RGB_MULT)
 
     def horizontal_line(self, colour: Colour, value: float) -> None:
-        """Draw a line over the width of the panel at `value`, degC or t/h as the axis."""
+        """Draw a line across the panel at `value`, in the unit of the vertical axis."""
         left = self._rectangle.left
         right = self._rectangle.right
         y = self.y(value)

@@ -175,8 +175,9 @@ def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
         return []
     groups = []
     for text, parameters_of_plant in zip(texts, parameters, strict=True):
-        # An example of a text is "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>". For an
-        # environment without an id, it is "<TimeLimit<MiddlePointEnv instance>>".
+        # A text names the layers of an environment, as in
+        # "<TimeLimit<MiddlePointEnv<MiddlePoint-v0>>>", or without an id
+        # "<TimeLimit<MiddlePointEnv instance>>".
         *classes, innermost = text.strip("<>").split("<")
         wrappers = tuple(name for name in classes if name not in _NEUTRAL)
         if isinstance(parameters_of_plant, Parameters):

@@ -349,7 +349,9 @@ class MiddlePointTorchEnv(BatchEnv):
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
             reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
         if "reset_mask" in options and "signals" in options:
-            raise ValueError("options['signals'] needs a reset of all plants, without mask")
+            raise ValueError(
+                "options['signals'] needs a reset of all plants, without reset_mask"
+            )
         if "reset_mask" not in options:  # external signals last until the next such reset
             self._external = read_external(options.get("signals"), self.parameters, self._zeros)
             self._signals = {**self._own_signals}

@@ -87,9 +87,10 @@ class History:
         self.rows = [*self.rows[len(self.rows) - self._length :], *block]
 
     def reset(self, restart: Restart, newest: Tensor | None = None) -> None:
-        """Drop the unused rows, and set the values of the plants in `restart.mask` to zero.
+        """Begin an episode of the plants in `restart.mask`, with values of 0.
 
-        If `newest`, shape (n,), is given, these plants have the values `newest` at k = 0.
+        Samples that no step has returned are forgotten for all plants. If `newest`, shape (n,),
+        is given, the values at k = 0 are not 0, but `newest`.
         """
         end = len(self.rows) - restart.unused_rows
         rows = self.rows[end - self._length : end]
@@ -314,7 +315,7 @@ def _finite_values(path: str, value: Any, zeros: Tensor, dimensions: int, shape:
     zeros
         Zeros of the device and type to use, shape (n,).
     dimensions
-        How many dimensions the numbers of one episode have, of which the last has the size n.
+        Number of dimensions without the dimension of episodes; the last has the size n.
     shape
         The shape of the numbers of one episode, for an error message.
     """

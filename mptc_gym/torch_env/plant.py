@@ -64,7 +64,7 @@ class TorchPlants:
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
-        """Prepare plants whose numbers, such as delay and dead zone, `episodes` hold."""
+        """Prepare the plants; `episodes` holds delays, dead zones and other plant numbers."""
         self._episodes = episodes
         self._zeros = episodes.zeros
         self._dynamics = Dynamics(parameters)
@@ -156,8 +156,8 @@ class TorchPlants:
         The results are the commanded flows u(k) and the applied flows u_a(k), t/h, shape (n,).
         """
         u_min, u_max = self._limits
-        # Last formula of the paper's Section 4. In float64, rounding is that of NumPy; in
-        # float32, speed counts more.
+        # Actions from -1 to 1 command flows from u_min to u_max (last formula of the paper's
+        # Section 4). In float64, rounding is that of NumPy; in float32, speed counts more.
         if actions.dtype == torch.float64:
             command = actions.add(1.0).mul_(self._half_range).add_(u_min)
         else:

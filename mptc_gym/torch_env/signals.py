@@ -84,7 +84,10 @@ class RandomSetPoint:
         self._next_level_end = self._level_end
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin an episode of the plants in `restart.mask`; return y_d(0), degC, shape (n,)."""
+        """Begin an episode of the plants in `restart.mask`, and return the first set points.
+
+        The set points y_d(0), degC, have the shape (n,).
+        """
         self._time -= restart.unused_rows
         self._forget_past_levels()
         levels, lengths = self._draw()
@@ -126,7 +129,7 @@ class RepeatedSetPoint:
     """A set point that repeats a sequence of levels, which all plants share."""
 
     def __init__(self, levels: SetPointLevels, episodes: Episodes) -> None:
-        """Take the levels, degC, and for how many samples each level holds from `levels`."""
+        """Take the levels, degC, and their lengths, samples, from `levels`."""
         self._n = len(episodes.zeros)
         self._levels = episodes.zeros.new_tensor(levels.values)
         # The samples of a period at which the levels end.
@@ -152,6 +155,7 @@ class Disturbance:
     """
 
     def __init__(self, episodes: Episodes) -> None:
+        """Begin with a load of 0; `episodes` holds plant numbers and generator."""
         self._episodes = episodes
         # The two parts of the load, steps and walk, degC.
         self._steps = History(episodes.zeros, 1)
@@ -216,10 +220,7 @@ Signal = Noise | RandomSetPoint | RepeatedSetPoint | Disturbance | ExternalValue
 
 
 def make_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
-    """Return set point, noises and load of an environment, by name, as the arguments say.
-
-    A noise or a load that is always 0 is left out.
-    """
+    """Return the signals of an environment by name, without those that are always 0."""
     levels = SetPointLevels(parameters)
     signals: dict[str, Signal] = {}
     if levels.random:
