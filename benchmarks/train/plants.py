@@ -81,7 +81,7 @@ class Batch:
 
     @property
     def signals(self) -> dict[str, Tensor]:
-        """Plant numbers, set points and coloured noise, an option of the environment's reset.
+        """Plant numbers, set points and noise, as the option `signals` of the reset.
 
         The noise, degC, is C xi: the white noise after the polynomial C of equation (28) of the
         paper.
