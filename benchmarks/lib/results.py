@@ -65,10 +65,10 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
         except BaseException:
             if _files(unfinished) == [RECORD]:
                 shutil.rmtree(unfinished)
-                raise
-            print(f"\nThe run has not finished. Its results so far are in {unfinished}/.")
-            if conditions:
-                print("The same command continues with them.")
+            else:
+                print(f"\nThe run has not finished. Its results so far are in {unfinished}/.")
+                if conditions:
+                    print("The same command continues with these results.")
             raise
         try:
             _replace(final, unfinished)
