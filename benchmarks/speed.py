@@ -59,7 +59,7 @@ def work(options: Options) -> str:
 
 
 def make_environments(n: int, device: str | None) -> dict[str, Any]:
-    """Return the environments to measure with n plants each, by their names in the table.
+    """Return the environments to measure, each with n plants, by their names in the table.
 
     If `device` is None, the environments are CartPole, the plants in NumPy and, if PyTorch is
     installed and n is above 1, the plants in PyTorch on the CPU. Otherwise, the environments
@@ -89,8 +89,8 @@ def stepping(env: Any) -> Case:
     """Return a case that steps an environment with random actions.
 
     A vector environment is stepped for one episode of the plant, and resets itself. A single
-    environment is stepped for ten times as long, and is reset at the end of each of its own
-    episodes.
+    environment is stepped for the length of ten episodes of the plant, and is reset at the end
+    of each of its own episodes.
 
     Parameters
     ----------

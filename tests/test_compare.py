@@ -320,7 +320,7 @@ class TestCompare:
         said = capsys.readouterr().out
         assert "2 of 4 tasks failed; the other tasks have finished" in said
         assert "bad, constant: " in said
-        assert "--agent: 'my_controllers:Mine' cannot be loaded: AttributeError" in said
+        assert "--agent: 'bad=my_controllers:Mine' cannot be loaded: the module" in said
         assert not (tmp_path / "out").exists()
         assert "**Unfinished: 2 of 4 tasks are missing.**" in (out / "report.md").read_text()
         assert "2 of 4" in json.loads((out / "provenance.json").read_text())["missing"]

@@ -20,10 +20,8 @@ from benchmarks.lib.parallel import FanOut
 from tests.conftest import ROOT, python
 
 
-def draw(seed, calls=None, seconds=0.0):
-    """Return a random number of a seed, and leave a file for each call."""
-    if calls is not None:
-        (calls / f"{time.time_ns()}").touch()
+def draw(seed, seconds=0.0):
+    """Return a random number of a seed, after some time."""
     time.sleep(seconds)
     return [{"seed": seed, "drawn": np.random.default_rng(seed).normal()}]
 
@@ -42,20 +40,20 @@ def fail(seed):
     raise LocalError(f"no such plant as {seed}")
 
 
-def work(n, calls=None):
-    return {f"plant {seed}": partial(draw, seed, calls) for seed in range(n)}
+def work(n):
+    return {f"plant {seed}": partial(draw, seed) for seed in range(n)}
 
 
-def run(given, jobs=2):
-    return dict(FanOut(jobs=jobs).stream(given, "tasks"))
+def run(tasks, jobs=2):
+    return dict(FanOut(jobs=jobs).stream(tasks, "tasks"))
 
 
 def test_jobs_and_order_do_not_matter():
-    there = work(5)
-    there["plant 0"] = partial(draw, 0, None, 0.3)  # the first is not ready first
-    back = dict(reversed(there.items()))
-    for given, jobs in ((there, 1), (there, 2), (back, 2)):
-        results = run(given, jobs=jobs)
+    tasks = work(5)
+    tasks["plant 0"] = partial(draw, 0, 0.3)  # The first task is not ready first.
+    reversed_tasks = dict(reversed(tasks.items()))
+    for ordered_tasks, jobs in ((tasks, 1), (tasks, 2), (reversed_tasks, 2)):
+        results = run(ordered_tasks, jobs=jobs)
         assert results == {f"plant {seed}": draw(seed) for seed in range(5)}
     assert run({"pid": os.getpid}, jobs=1) == {"pid": os.getpid()}
     assert os.getpid() not in run({"one": os.getpid, "two": os.getpid}).values()

@@ -119,7 +119,7 @@ class TestUnfinished:
 
     def test_the_same_run_goes_on_and_ends_with_the_files_of_both(self, target, capsys):
         self.stop(target, CONDITIONS)
-        assert "The same command continues with them." in capsys.readouterr().out
+        assert "The same command continues with these results." in capsys.readouterr().out
         (unfinished(target) / "tasks").mkdir()
         run(target, {"report.md": "new"}, CONDITIONS)
         assert "The run continues with the results in" in capsys.readouterr().out

@@ -104,7 +104,8 @@ class FanOut:
             _connect_to_ray()
             yield from joblib.Parallel(self.jobs or -1, backend="ray")(calls)
             return
-        jobs = max(1, min(self.jobs or joblib.cpu_count(), len(calls)))
+        jobs = min(self.jobs or joblib.cpu_count(), len(calls))
+        jobs = max(jobs, 1)  # There are no calls if all results are stored.
         with joblib.parallel_config(
             "loky",
             inner_max_num_threads=1,
@@ -112,7 +113,7 @@ class FanOut:
             initargs=(os.getpid(),),
         ):
             parallel = joblib.Parallel(jobs, return_as="generator_unordered", batch_size=1)
-        # The processes that start here inherit that they ignore Ctrl-C.
+        # The processes that start here ignore Ctrl-C, too.
         handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             outcomes = parallel(calls)

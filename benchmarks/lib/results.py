@@ -21,10 +21,12 @@ from benchmarks.lib.errors import UnfinishedError, UsageError
 from benchmarks.lib.provenance import COMMAND_LINE, code_hash, versions
 from benchmarks.lib.storage import out_folder, write_json
 
-RECORD = "run.json"  # file in a folder of results: conditions, and names of the written files
-TASKS = "tasks"  # folder in the folder of an unfinished run: the results of finished tasks
-HARMLESS = {".DS_Store", "Thumbs.db"}  # files that file managers add to a folder
-IRRELEVANT = {"out", "fan_out"}  # fields of `Options` on which no result depends
+# Names in a folder of results: the file with the conditions and the names of the written files,
+# and the folder with the results of the finished tasks of an unfinished run.
+RECORD_FILE = "run.json"
+TASKS_FOLDER = "tasks"
+FILE_MANAGER_FILES = {".DS_Store", "Thumbs.db"}  # files that file managers add to a folder
+WITHOUT_INFLUENCE = {"out", "fan_out"}  # fields of `Options` on which no result depends
 
 
 @contextmanager
@@ -63,12 +65,12 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
         try:
             yield unfinished
         except BaseException:
-            if _files(unfinished) == [RECORD]:
+            if _files(unfinished) == [RECORD_FILE]:
                 shutil.rmtree(unfinished)
-                raise
-            print(f"\nThe run has not finished. Its results so far are in {unfinished}/.")
-            if conditions:
-                print("The same command continues with them.")
+            else:
+                print(f"\nThe run has not finished. Its results so far are in {unfinished}/.")
+                if conditions:
+                    print("The same command continues with these results.")
             raise
         try:
             _replace(final, unfinished)
@@ -100,23 +102,23 @@ def _lock(final: Path) -> AbstractContextManager[object]:
 
 
 def _files(folder: Path) -> list[str]:
-    """Return the sorted names of the files and folders in a folder, except `HARMLESS` ones.
+    """Return the sorted names of the files and folders in a folder, which need not exist.
 
-    If the folder does not exist, the list is empty.
+    The names in `FILE_MANAGER_FILES` are left out.
     """
     if not folder.exists():
         return []
-    return sorted({path.name for path in folder.iterdir()} - HARMLESS)
+    return sorted({path.name for path in folder.iterdir()} - FILE_MANAGER_FILES)
 
 
 def _record(folder: Path) -> dict[str, Any]:
-    """Return the content of the file `RECORD` in a folder of results.
+    """Return the content of the file `RECORD_FILE` in a folder of results.
 
     The keys are "command", "conditions" and, after a finished run, "files". If the file is
     missing or is not JSON, the dict is empty.
     """
     try:
-        record: dict[str, Any] = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        record: dict[str, Any] = json.loads((folder / RECORD_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return record
@@ -129,7 +131,7 @@ def _refuse_other_files(final: Path) -> None:
     """
     if final.exists() and not final.is_dir():
         raise UsageError(f"--out: {final} cannot be written to: it is not a folder")
-    recorded = {RECORD, *_record(final).get("files", [])}
+    recorded = {RECORD_FILE, *_record(final).get("files", [])}
     others = [name for name in _files(final) if name not in recorded]
     if others:
         listed = ", ".join(others[:3])
@@ -143,12 +145,12 @@ def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
     """Prepare the folder `unfinished`, which `results_folder` yields.
 
     If a run with equal `conditions` has left the folder, the folder stays as it is. Otherwise,
-    and if `conditions` is None, the folder becomes empty except for the file `RECORD`.
+    and if `conditions` is None, the folder becomes empty except for the file `RECORD_FILE`.
 
     Raises
     ------
     UsageError
-        If the folder has files but no valid `RECORD`, so that no run has written the files.
+        If the folder has files, but no valid `RECORD_FILE`: then no run has written the files.
     """
     record = _record(unfinished)
     has_files = bool(_files(unfinished))
@@ -161,19 +163,20 @@ def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
         print(f"The results in {unfinished}/ are of other options, code or packages.")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir()
-    write_json(unfinished / RECORD, {"command": COMMAND_LINE.get(), "conditions": conditions})
+    new_record = {"command": COMMAND_LINE.get(), "conditions": conditions}
+    write_json(unfinished / RECORD_FILE, new_record)
 
 
 def _replace(final: Path, unfinished: Path) -> None:
     """Replace the folder `final` by the folder `unfinished` of a run that has finished.
 
-    The names of the run's files are added to `RECORD`, and the results of single tasks are
+    The names of the run's files are added to `RECORD_FILE`, and the results of single tasks are
     removed.
     """
     _refuse_other_files(final)  # Somebody may have added files since the run began.
-    shutil.rmtree(unfinished / TASKS, ignore_errors=True)
+    shutil.rmtree(unfinished / TASKS_FOLDER, ignore_errors=True)
     record = {**_record(unfinished), "files": _files(unfinished)}
-    write_json(unfinished / RECORD, record)
+    write_json(unfinished / RECORD_FILE, record)
     earlier = final.with_name(f".{final.name}.earlier")
     shutil.rmtree(earlier, ignore_errors=True)
     if final.exists():
@@ -194,7 +197,7 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
         The name of the command, such as "sweep".
     options
         The command's options, a dataclass. An option that is a file is replaced by a hash of
-        the content of the file. The options in `IRRELEVANT` are left out.
+        the content of the file. The options in `WITHOUT_INFLUENCE` are left out.
     """
     conditions = {
         "command": command,
@@ -207,12 +210,12 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
 
 
 def _relevant(options: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return pairs of name and value as a dict, without the names in `IRRELEVANT`.
+    """Return pairs of name and value as a dict, without the names in `WITHOUT_INFLUENCE`.
 
     `dataclasses.asdict` calls this function for the dataclass of options, and for each
     dataclass in it.
     """
-    return {name: value for name, value in options if name not in IRRELEVANT}
+    return {name: value for name, value in options if name not in WITHOUT_INFLUENCE}
 
 
 def _content(value: object) -> str:
@@ -253,7 +256,7 @@ class KeptResults:
     Attributes
     ----------
     folder : Path
-        The folder that `results_folder` yields. The files are in its folder `TASKS`.
+        The folder that `results_folder` yields. The files are in its folder `TASKS_FOLDER`.
     save_file : callable
         Saves the result of a task to a file: `save_file(path, result)`.
     load_file : callable
@@ -266,7 +269,7 @@ class KeptResults:
 
     def path(self, name: str) -> Path:
         """Return the path of the file for the result of the task called `name`."""
-        return self.folder / TASKS / f"{quote(name, safe=' ,')}.npz"
+        return self.folder / TASKS_FOLDER / f"{quote(name, safe=' ,')}.npz"
 
     def load(self, name: str) -> Any:
         """Return the stored result of the task called `name`; None if no result is stored."""

@@ -31,11 +31,12 @@ class Options:
     network: Annotated[str, Parameter(choices=NETWORKS)] = field(kw_only=False)
     """The kind of network to train."""
     networks: Count = 5
-    """Number of networks to train, each from another seed; `compare` runs all of them."""
+    """The number of networks to train, each from a seed of its own. All are compared: none is
+    chosen."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     steps: Count | None = None
-    """Length of a training: steps of the optimiser or, for PPO, samples of experience
-    (default: as published)."""
+    """The length of a training: steps of the optimiser or, for PPO, samples of experience
+    (default: as for the published networks)."""
     out: Folder = Path("results/networks")
     fan_out: FanOut = field(default_factory=FanOut)
 

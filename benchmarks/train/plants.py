@@ -81,7 +81,7 @@ class Batch:
 
     @property
     def signals(self) -> dict[str, Tensor]:
-        """Plant numbers, set points and coloured noise, an option of the environment's reset.
+        """Plant numbers, set points and noise, as the option `signals` of the reset.
 
         The noise, degC, is C xi: the white noise after the polynomial C of equation (28) of the
         paper.
@@ -295,10 +295,10 @@ class Sampler:
     ) -> Prior:
         """Return the models and their probabilities, from which the bank of each plant starts.
 
-        The bank of every plant has `DELAYS` delays times the time constants of
-        `TIME_CONSTANTS`. For a plant with an exact step test, the model of the step test has
-        the probability 1. For half of the inexact step tests, a model is less probable if its
-        delay is wrong.
+        A model is a pair of a delay and a time constant, of which each bank has `DELAYS` and
+        those of `TIME_CONSTANTS`. For a plant with an exact step test, the model of the step
+        test has the probability 1. For half of the plants that are not like the preset `hard`,
+        models with a wrong delay are less probable.
 
         Parameters
         ----------
@@ -313,19 +313,20 @@ class Sampler:
         """
         poles = 1.0 - (1.0 - POLE) / time_constant_factors
         time_constants = -1.0 / torch.log(poles)  # samples
-        place = self._uniform(
-            0.0, DELAYS
-        ).floor()  # of the plant's delay among those of the bank
-        shortest = (delays - place).clamp(min=1.0)
+        # The place of the plant's delay among the delays of its bank, 0 for the shortest.
+        places = self._uniform(0.0, DELAYS).floor()
+        shortest = (delays - places).clamp(min=1.0)
         shortest = torch.where(is_hard, HARD["delay"][0], shortest)
+        # The delay of each model minus the plant's delay, samples, shape (DELAYS, n).
         delay_errors = torch.arange(float(DELAYS))[:, None] - (delays - shortest)
         has_delay_prior = ~is_hard & self._true_for(0.5)
-        of_delays = -0.5 * (delay_errors / DELAY_SPREAD).square() * has_delay_prior
-        of_time_constants = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
+        # Both priors are normal distributions, the second one of the time constant's logarithm.
+        delay_terms = -0.5 * (delay_errors / DELAY_SPREAD).square() * has_delay_prior
+        time_constant_terms = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
+        # The logarithm of each model's probability, shape (DELAYS, time constants, n).
+        logarithms = delay_terms[:, None] + torch.from_numpy(time_constant_terms)[:, None]
         has_middle_time_constant = torch.from_numpy(TIME_CONSTANTS == 1.0)[:, None]
         is_step_test = (delay_errors[:, None] == 0.0) & has_middle_time_constant
-        # Now of each model, shape (DELAYS, time constants, n).
-        logarithms = of_delays[:, None] + torch.from_numpy(of_time_constants)[:, None]
         logarithms += torch.where(is_exact & ~is_step_test, IMPROBABLE, 0.0)
         return Prior(
             time_constants=(torch.from_numpy(TIME_CONSTANTS)[:, None] * time_constants).numpy(),

@@ -83,6 +83,7 @@ class Recipe:
     @property
     def temperature_scale(self) -> float:
         """The amplitude of the set points, as a multiple of the paper's amplitude."""
+        # `for_plant` scales the reward's error in proportion to the amplitude.
         error_scale: float = self.plants[0].arguments.get("error_scale", ERROR_SCALE)
         return error_scale / ERROR_SCALE
 
