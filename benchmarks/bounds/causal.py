@@ -106,13 +106,15 @@ class SetPointLaw:
         self._impulse = at_start.impulse_response(samples + zeros)[zeros:]
 
     def penalty(self, setpoint: Array) -> Array:
-        """Return the prices pi(j) of the flows u_a(j), degC per t/h, shape (samples,).
+        """Return the prices of the flows in one episode, degC per t/h, shape (samples,).
 
-        `setpoint` holds the set points y_d(k) of one episode, degC, shape (samples,).
+        The price of the flow at sample j is pi(j) in the description of the module. `setpoint`
+        holds the set points of the episode, degC, shape (samples,).
         """
         samples = len(setpoint)
         slope = np.zeros(samples)  # g(k)
-        expected = np.zeros((samples, samples))  # [k, j]: E[g(k) | set points up to j]
+        # Row k, column j: the conditional mean of g(k), given the set points up to j.
+        expected = np.zeros((samples, samples))
         previous_level = 0.0  # before the episode
         for start, end in held(setpoint):
             level = setpoint[start]
@@ -120,7 +122,7 @@ class SetPointLaw:
             slope_if_held = self._slope_after_change(previous_level, level)
             slope_if_held += self._slope_after_arrival(change_sums)
             slope[start:end] = slope_if_held[: end - start]
-            for j in range(start, end):
+            for j in range(start, end):  # The age of the level is j - start.
                 later_ages = np.arange(j + 1 - start, samples - start)
                 expected[j + 1 :, j] = self._expected_slope(
                     later_ages, j - start, slope_if_held, change_sums

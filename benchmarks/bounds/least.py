@@ -189,7 +189,10 @@ class _Episodes(NamedTuple):
 
 
 def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
-    """Return the environment's episodes with the seeds `seed`, `seed + 1` and so on."""
+    """Return the plants, set points and idle-valve errors of the environment's episodes.
+
+    An episode has the samples k = 0 to `samples`, and episode i has the seed `seed + i`.
+    """
     numbers = drawn_numbers(parameters, episodes, seed)
     with closing(make_plants(episodes, samples + 1, **asdict(parameters))) as plants:
         idle_valve = IdleValve(numbers.u_min, numbers.u_max)

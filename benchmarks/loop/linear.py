@@ -50,7 +50,7 @@ class LinearModel:
 
     A model has several plants at one sample k, or one plant at several samples k, or one plant
     at one sample. The coefficients of a plant that drifts hold for the step from k - 1 to k. In
-    the shapes below, the dots stand for the axis of the plants or of the samples, which is
+    the shapes of arrays, dots stand for the axis of the plants or of the samples, which is
     missing for one plant at one sample.
 
     Parameters
@@ -92,9 +92,10 @@ class LinearModel:
 
     @property
     def gain(self) -> Array:
-        """Steady-state gain, degC per t/h, shape (...); infinite for an integrating plant.
+        """Steady-state gain B(1) / A(1), degC per t/h, of each plant or at each sample.
 
-        The gain is B(1) / A(1) with the polynomials A and B of equation (28) of the paper.
+        The gain of an integrating plant is infinite. A and B are the polynomials of equation
+        (28) of the paper.
         """
         with np.errstate(divide="ignore"):
             return np.asarray(self.beta.sum(axis=-1) / (1.0 - self.alpha.sum(axis=-1)))
@@ -127,11 +128,11 @@ class LinearModel:
         return abs(slowest_pole([1.0, *-self.alpha]))
 
     def impulse_response(self, samples: int) -> Array:
-        """Return the impulse response of the plants, degC per t/h, shape (..., samples).
+        """Return the impulse response of each plant, degC per t/h, shape (..., samples).
 
         The first value is the effect of a flow of 1 t/h at one sample on the output d + 1
-        samples later, where d is the delay of the plant in samples. A drift of the plant is
-        left out.
+        samples later, where d is the delay of the plant in samples. Drifts of the plants are
+        left out. The dots in the shape stand for the axis of the plants.
         """
         response = np.zeros((*self.load.shape, samples))
         response[..., : self.beta.shape[-1]] = self.beta[..., :samples]
@@ -154,9 +155,9 @@ class LinearModel:
         Returns
         -------
         F : Array
-            The state transition matrix, shape (..., size, size).
+            The state transition matrix, by plant or by sample, shape (..., size, size).
         g : Array
-            The effect of the noise, elements 0 and 1, shape (size,).
+            The effect of the noise xi(k) on each element of the state, shape (size,).
         """
         c = self.parameters.c
         order = self.outputs_in_state
@@ -183,14 +184,14 @@ class LinearModel:
         ----------
         stays
             The mean of the piecewise constant part at sample k as a share of its value at
-            sample k - 1, shape (...).
+            sample k - 1; a number for each plant or sample.
 
         Returns
         -------
         F : Array
-            The state transition matrix, shape (..., size, size).
+            The state transition matrix, by plant or by sample, shape (..., size, size).
         E : Array
-            The effects of v(k) on the state, shape (..., size, 3).
+            The effects of v(k) on each element of the state, shape (..., size, 3).
         """
         F_noise, g = self.state_space()
         size = len(g) + 2
@@ -235,13 +236,13 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     Returns
     -------
     dict
-        `gain`, degC per t/h, and `time_constant`, `delay` and `sampling_interval`, s. The names
-        are those of the arguments of `PIController.simc` and `SmithPredictor`.
+        `gain`, degC per t/h, and `time_constant`, `delay` and `sampling_interval`, s, which
+        `PIController.simc` and `SmithPredictor` take as arguments.
 
     Raises
     ------
     ValueError
-        If the plant reaches no new steady state, or if its gain is 0.
+        If the plant reaches no new steady state, or if the gain of the plant is 0.
     """
     plant = nominal(parameters)
     interval = parameters.sampling_interval
@@ -312,16 +313,16 @@ class LinearLoop:
     def of(cls, controller: LinearController, plant: LinearModel) -> "LinearLoop":
         """Return the closed loop of `controller` and `plant`, which must be a single plant."""
         controller_numerator, controller_denominator = controller.transfer()
+        # The coefficients of B begin at z^-1: a flow affects the next output at the earliest.
         numerator = np.convolve(controller_numerator, np.append(0.0, plant.beta))
         denominator = np.convolve(controller_denominator, np.append(1.0, -plant.alpha))
         return cls(numerator, denominator, round(plant.numbers.delay))
 
     def characteristic(self, delay: int) -> Array:
-        """Return the characteristic polynomial of the loop for any delay of the plant.
+        """Return the characteristic polynomial of the loop if the plant has a given delay.
 
-        The result has the coefficients of z^0, z^-1, z^-2 and so on. The poles of the loop are
-        the values of z at which the polynomial is 0. `delay` is the delay d of the plant,
-        samples.
+        The array has the coefficients of z^0, z^-1, z^-2 and so on. The poles of the loop are
+        the values of z at which the polynomial is 0. `delay` is in samples.
         """
         delayed_numerator = np.append(np.zeros(delay), self.numerator)
         return np.asarray(polyadd(self.denominator, delayed_numerator), np.float64)
@@ -358,12 +359,11 @@ class LinearLoop:
         return float(np.abs(sensitivity).max())
 
     def stable_delays(self) -> tuple[int, int] | None:
-        """Return the shortest and the longest delay of the plant with which the loop is stable.
+        """Return the ends of the range of delays, in samples, with which the loop is stable.
 
-        The delays d of equation (28) of the paper are counted in samples. The loop is stable
-        with all delays from the shortest to the longest, and one of these is the delay of the
-        plant. Delays above `LONGEST_DELAY` are not examined. The result is None if the loop is
-        unstable with the delay of the plant.
+        The range contains the delay d of the plant, equation (28) of the paper. Delays above
+        `LONGEST_DELAY` are not examined. The result is None if the loop is unstable with the
+        delay of the plant.
         """
         if not self.is_stable(self.delay):
             return None
@@ -384,16 +384,16 @@ def time_constant_for(
 ) -> float:
     """Return the smallest time constant of a controller with which a loop is robust enough, s.
 
-    A loop is robust enough if Ms, its maximum sensitivity, is at most `target`. The loop is
-    robust enough with all larger time constants that were tried, too.
+    A loop is robust enough if its maximum sensitivity Ms is at most `target`. The search starts
+    at the largest time constant and stops at the first that does not make the loop robust.
 
     Parameters
     ----------
     target
         The largest Ms that is allowed.
     make
-        Takes a time constant, s, and returns a controller with this time constant. A larger
-        time constant makes the loop more robust.
+        A function that takes a time constant, s, and returns a controller. A larger time
+        constant makes the loop more robust.
     plant
         The model of a single plant.
     slowest, fastest
