@@ -151,21 +151,14 @@ def least_possible(
 
 
 def with_hidden_load(
-    *,
-    samples: int,
-    kind: str | None = None,
-    episodes: int = EPISODES,
-    seed: int = SEED,
-    **arguments: Any,
+    *, samples: int, episodes: int = EPISODES, seed: int = SEED, **arguments: Any
 ) -> Estimate:
     """Return an estimate of the least possible mean |e(k)| if nobody measures the load, degC.
 
     The estimate is not a bound: see `hidden.py`. For a case without a load, the result is the
     least possible error. `least_possible` describes the parameters and exceptions.
     """
-    least = least_possible(
-        samples=samples, kind=kind, episodes=episodes, seed=seed, **arguments
-    )
+    least = least_possible(samples=samples, episodes=episodes, seed=seed, **arguments)
     parameters = Parameters(**arguments)
     if not parameters.is_disturbed:
         return least
@@ -208,9 +201,10 @@ def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Ep
 def _bound(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
-    """Return the least possible error for one of `KINDS`; a NoBoundError is raised without one.
+    """Return the least possible error of one of `KINDS`.
 
-    `least_possible` describes the parameters.
+    `least_possible` describes the parameters. A NoBoundError is raised if the reference does
+    not exist.
     """
     if not is_random(parameters):
         episodes = 1
