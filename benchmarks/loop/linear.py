@@ -119,6 +119,7 @@ class LinearModel:
         The lag is d + 1 for the delay d of the plant, plus the number of leading zeros in the
         polynomial B of equation (28) of the paper. The model must have one plant.
         """
+        # The added 1 is found if all coefficients of B are 0.
         first_nonzero = np.flatnonzero([*self.parameters.b, 1.0])[0]
         return int(self.numbers.delay) + 1 + int(first_nonzero)
 
@@ -163,12 +164,13 @@ class LinearModel:
         order = self.outputs_in_state
         size = order + len(c) - 1
         F = np.zeros((*self.load.shape, size, size)) + np.eye(size, k=-1)
-        F[..., order : order + 1, :] = 0.0  # xi(k) is new
+        xi_row = slice(order, order + 1)  # the row of xi(k); no row if C = 1
+        F[..., xi_row, :] = 0.0  # xi(k) does not depend on x(k-1)
         F[..., 0, : self.alpha.shape[-1]] = self.alpha
         F[..., 0, order:] = c[1:]
         g = np.zeros(size)
         g[0] = 1.0
-        g[order : order + 1] = 1.0  # empty if C = 1: the state then has no noise
+        g[xi_row] = 1.0
         return F, g
 
     def state_space_with_load(self, stays: Array) -> tuple[Array, Array]:
@@ -258,14 +260,15 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     # The response begins with the last sample at which the output stands still.
     response = np.append(0.0, plant.impulse_response(samples).cumsum())
     response /= response[-1]
-    late = _time_of(LATE_LEVEL, response)
-    time_constant = 1.5 * (late - _time_of(EARLY_LEVEL, response))
-    # In samples; u(k) shows at y(k + 1) at the earliest.
-    delay = max(1, round(round(plant.numbers.delay) + late - time_constant + 1.0))
+    late_time = _time_of(LATE_LEVEL, response)  # samples
+    early_time = _time_of(EARLY_LEVEL, response)
+    time_constant = 1.5 * (late_time - early_time)
+    # A flow affects the next output at the earliest.
+    delay = round(plant.numbers.delay) + late_time - time_constant + 1.0
     return {
         "gain": float(f"{plant.gain:.4g}"),
         "time_constant": float(f"{time_constant * interval:.3g}"),
-        "delay": delay * interval,
+        "delay": max(1, round(delay)) * interval,
         "sampling_interval": interval,
     }
 
