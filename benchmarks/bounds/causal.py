@@ -22,10 +22,10 @@ choice of pi in this module is
     pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
 
 G[k, j] is the effect of the flow u_a(j) on the output y(k). The *slope* g(k) is a rough
-estimate of how fast E|e(k)| rises with the expected error at k, in degC per degC. A formula
-gives the conditional means of g(k). After a change of the set point, g is the sign of the
-change until the output can have reached the new level. Then g is a number between -1 and 1,
-which weighs staying at the present level against moving towards 0, the mean of the next level.
+estimate of how fast E|e(k)| rises with the expected error at k, in degC per degC. After a
+change of the set point, g is the sign of the change until the output can have reached the new
+level. Then g is a number between -1 and 1, which weighs staying at the present level against
+moving towards 0, the mean of the next level.
 """
 
 import numpy as np
@@ -139,23 +139,23 @@ class SetPointLaw:
         slope_if_held: Array,
         change_sums: Array,
     ) -> Array:
-        """Return the conditional means of the slope g, given that a level has reached an age.
+        """Return the mean slopes of the error, given that a level has reached an age.
 
         Parameters
         ----------
         ages
-            Ages of the level at which g is wanted, samples, all above `known_age`.
+            Ages of the level at which the means are wanted, samples, all above `known_age`.
         known_age
             Age up to which the level is known not to change, samples.
         slope_if_held
-            The slope g by age if the level never changes, shape (samples,).
+            The slope by age if the level never changes, shape (samples,).
         change_sums
             What `_sums_after_next_change` returns for the level.
 
         Returns
         -------
         ndarray
-            The conditional means of g, in the shape of `ages`.
+            The conditional means of the slope, in the shape of `ages`.
         """
         # The next level begins at an age from `first` to `longest`, all equally probable.
         first = max(self._shortest, known_age + 1)
@@ -166,7 +166,10 @@ class SetPointLaw:
         return expected
 
     def _slope_after_change(self, previous_level: float, level: float) -> Array:
-        """Return the slope g after a change of the set point, by age, shape (samples,).
+        """Return the slopes of the error after a change of the set point, shape (samples,).
+
+        Element i is the slope at the age i of the new level: an estimate of how fast the mean
+        absolute error rises with the expected error, from -1 to 1.
 
         The set point changes from `previous_level` to `level`, degC. The slope is the sign of
         the change times the probability that the error is larger than the noise. The slope is 0
@@ -197,7 +200,7 @@ class SetPointLaw:
         return mean
 
     def _sums_after_next_change(self, level: float) -> Array:
-        """Return cumulative sums of the mean slope g after the next change from `level`, degC.
+        """Return cumulative sums of the mean slopes after the next change from `level`, degC.
 
         The element `longest + 1 + i` is the sum over the samples from the change to i samples
         after the change. The first `longest + 1` elements, for samples before the change, are
@@ -208,12 +211,12 @@ class SetPointLaw:
         return np.append(np.zeros(self._longest + 1), np.cumsum(mean_slope))
 
     def _slope_after_arrival(self, change_sums: Array) -> Array:
-        """Return the slope g at ages after the output's arrival, by age, shape (samples,).
+        """Return the slopes of the error after the output has arrived at a level, by age.
 
-        The slopes solve one equation for each age: an additional flow that acts from this age
-        on does not change the expected error. So the sum over later ages of the impulse
-        response times the mean of g is 0. The highest age comes first. `change_sums` is what
-        `_sums_after_next_change` returns.
+        The slopes solve an equation for each age: an additional flow that acts from the age on
+        does not change the mean error. So the sum of the impulse response times the mean slopes
+        is 0. The equation of the highest age is solved first. `change_sums` is what
+        `_sums_after_next_change` returns for the level.
         """
         samples = len(self._probability_held)
         slope = np.zeros(samples)

@@ -54,7 +54,7 @@ KINDS = "preview", "causal", "reference"
 class LeastPossible(Estimate):
     """The least possible mean |e| of a case, degC, with a 95 % interval over random episodes.
 
-    If the least error is the same in all episodes, `low` and `high` equal `value`.
+    The interval has the length 0 if the least error is the same in all episodes.
     """
 
     kind: str  # one of `KINDS`

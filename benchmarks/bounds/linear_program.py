@@ -62,7 +62,7 @@ class ErrorBounds:
         """For each line, the length of the interval on which the line is the highest, degC.
 
         The intervals divide the magnitudes of the expected error from 0 to infinity. The
-        interval of the last line is infinitely long. The shape is (samples, slopes).
+        lengths have the shape (samples, slopes), and the last length is infinite.
         """
         ends = np.full(self.intercepts.shape, np.inf)
         corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)

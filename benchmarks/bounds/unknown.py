@@ -6,8 +6,8 @@ the right side. The load is the sum of a random walk and of a piecewise constant
 changes are called *jumps*.
 
 A flow at sample j affects the output y(j + d + 1) at the earliest. So no flow counteracts the
-effects on y(k) of noise, walk and jumps after the sample k - d - 1. Let n(k) be the sum of
-these effects, degC, and m(k) the error that there would be if n(k) were 0. The error is
+effects on y(k) of noise, walk and jumps after the sample k - d - 1. Let n(k) be the sum of the
+effects that no flow counteracts, degC, and m(k) the error if n(k) were 0. The error is
 
     e(k) = m(k) - n(k).
 
@@ -113,8 +113,8 @@ def error_bounds(model: LinearModel) -> ErrorBounds:
 def bounds_for_normal(variance: Array) -> ErrorBounds:
     """Return the lower bounds of the mean errors if the inevitable errors are normal.
 
-    `variance` holds the variance of the part of the error that no flow can counteract in time,
-    degC^2, for each sample, shape (samples,). This part has the mean 0.
+    `variance` holds the variance of the inevitable error, which no flow can counteract in time,
+    degC^2, for each sample, shape (samples,). The inevitable error has the mean 0.
     """
     if not variance.any():
         return ErrorBounds(np.ones(1), np.zeros((len(variance), 1)))

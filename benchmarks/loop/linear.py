@@ -325,7 +325,7 @@ class LinearLoop:
         """Return the characteristic polynomial of the loop if the plant has a given delay.
 
         The array has the coefficients of z^0, z^-1, z^-2 and so on. The poles of the loop are
-        the values of z at which the polynomial is 0. `delay` is in samples.
+        the zeros of the characteristic polynomial in z. `delay` is in samples.
         """
         delayed_numerator = np.append(np.zeros(delay), self.numerator)
         return np.asarray(polyadd(self.denominator, delayed_numerator), np.float64)
