@@ -5,9 +5,9 @@ known distribution. The *levels*, the values between changes, are independent an
 distributed in [-A, A]. The number of samples for which a level lasts is uniformly distributed
 from S to L. The *age* of a level is the number of samples since the level began.
 
-A controller without preview learns of a change of the set point when the change happens. So the
-flow u_a(j) depends only on the set points up to j. For every price pi(j) of the flow with
-E[pi(j) | set points up to j] = 0, it follows that
+A controller without preview learns of a change of the set point when the change happens, so the
+flow u_a(j) of the controller depends only on the set points up to j. For every price pi(j) of
+the flow with E[pi(j) | set points up to j] = 0, it follows that
 
     E[sum_j pi(j) u_a(j)] = 0.
 

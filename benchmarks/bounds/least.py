@@ -141,7 +141,7 @@ def least_possible(
         return _bound(*case, kind)
     if has_random_setpoint:
         return _bound(*case, "causal")
-    setpoint = _draw(parameters, samples, 1, seed).setpoints[0]
+    setpoint = _episodes_of(parameters, samples, 1, seed).setpoints[0]
     if np.ptp(setpoint) == 0.0:  # Without a change, foresight makes no difference.
         return _bound(*case, "preview")
     try:
@@ -162,10 +162,11 @@ def with_hidden_load(
     parameters = Parameters(**arguments)
     if not parameters.is_disturbed:
         return least
-    drawn = _draw(parameters, samples, len(least.episodes), seed)
+    sampled = _episodes_of(parameters, samples, len(least.episodes), seed)
     estimates = []
     for i, bound in enumerate(least.episodes):
-        episode = parameters, least.kind, drawn.numbers[i], drawn.setpoints[i]
+        # The first arguments of `_error_sum`.
+        episode = parameters, least.kind, sampled.numbers[i], sampled.setpoints[i]
         hidden_load = _error_sum(*episode, bounds_with_hidden_load)
         known_load = _error_sum(*episode, bounds_with_known_load)
         estimates.append(bound + (hidden_load - known_load) / samples)
@@ -181,7 +182,7 @@ class _Episodes(NamedTuple):
     idle_errors: Array
 
 
-def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
+def _episodes_of(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
     """Return the plants, set points and idle-valve errors of the environment's episodes.
 
     An episode has the samples k = 0 to `samples`, and episode i has the seed `seed + i`.
@@ -208,16 +209,16 @@ def _bound(
     """
     if not is_random(parameters):
         episodes = 1
-    drawn = _draw(parameters, samples, episodes, seed)
+    sampled = _episodes_of(parameters, samples, episodes, seed)
     bounds = episodes
     if not (parameters.ranges or parameters.setpoint == "random"):
         bounds = 1  # Noise and load do not change the bound.
     values = []
     for i in range(bounds):
-        error_sum = _error_sum(parameters, kind, drawn.numbers[i], drawn.setpoints[i])
+        error_sum = _error_sum(parameters, kind, sampled.numbers[i], sampled.setpoints[i])
         # Rounded to be the same on all machines, as solvers differ in later digits.
         values.append(round(error_sum / samples, 6))
-    idle = student(drawn.idle_errors)
+    idle = student(sampled.idle_errors)
     return LeastPossible(**vars(student(values)), kind=kind, idle=idle, episodes=tuple(values))
 
 

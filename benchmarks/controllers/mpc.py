@@ -317,7 +317,7 @@ class PredictiveController:
         Parameters
         ----------
         model, slopes
-            The plants, and the second argument of `_Model.cost`.
+            The plants, and the argument `slopes` of `_Model.cost`.
         plan
             The planned flows, t/h, shape (HORIZON, runs).
 
@@ -358,7 +358,7 @@ class PredictiveController:
         Parameters
         ----------
         model, slopes
-            The plants, and the second argument of `_Model.cost`.
+            The plants, and the argument `slopes` of `_Model.cost`.
         start
             The planned flows with which the descent starts, t/h, shape (HORIZON, runs).
         first_flow

@@ -249,7 +249,7 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     plant = nominal(parameters)
     interval = parameters.sampling_interval
     if plant.slowest_pole > SLOWEST_POLE:
-        raise ValueError(f"a must be of a stable plant for a step test, got {parameters.a}")
+        raise ValueError(f"a must belong to a stable plant for a step test, got {parameters.a}")
     if plant.gain == 0.0:
         raise ValueError(f"b must have a sum other than 0 for a gain, got {parameters.b}")
     settling_time = 0.0  # samples
