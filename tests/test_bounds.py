@@ -26,9 +26,7 @@ from mptc_gym.plant.dynamics import action_from_command
 from tests.verify_bounds import CONTROLLERS, beats, errors
 
 CALM = Parameters()
-
-
-SHARES = np.linspace(0.0, 1.0, 21)
+SHARES = np.linspace(0.0, 1.0, 21)  # of the known level of the load, in a forecast
 
 
 def run_mpc(runs, samples, seed=0, **arguments):
@@ -42,32 +40,33 @@ def minimum_variance(parameters):
     return parameters.noise_variance * f @ f
 
 
-def course_of(samples, **arguments):
+def plant_of(samples, **arguments):
     parameters = Parameters(**arguments)
     return LinearModel(parameters, parameters.lowest, np.arange(samples))
 
 
 def best_plan(setpoint, /, **arguments):
     """Return the bounds of the errors and the flow of the plan with preview."""
-    of_plant = course_of(len(setpoint), **arguments)
-    return plan(of_plant, error_bounds(of_plant), np.asarray(setpoint, np.float64))
+    model = plant_of(len(setpoint), **arguments)
+    return plan(model, error_bounds(model), np.asarray(setpoint, np.float64))
 
 
-def change(level, samples, **arguments):
-    """Return the least sum of |e| after a change from rest at 0 to a level."""
-    of_plant, setpoint = course_of(samples + 110, **arguments), np.full(samples, level)
-    return reference(of_plant, error_bounds(of_plant), setpoint)[0].sum()
+def least_error_sum(level, samples, **arguments):
+    """Return the least sum of |e| after a set-point change from rest at 0 to `level`, degC."""
+    model = plant_of(samples + 110, **arguments)
+    setpoint = np.full(samples, level)
+    return reference(model, error_bounds(model), setpoint).errors.sum()
 
 
 def test_responses_to_single_flows_are_those_of_the_plant():
-    model, parameters = course_of(40, delay=3, dead_zone=0.5), Parameters()
+    model, parameters = plant_of(40, delay=3, dead_zone=0.5), Parameters()
     G = response(*equations(model, 40))
     pulse = signal.lfilter([0.0] * 4 + list(parameters.b), parameters.a, np.eye(40)[0])
     for j in (0, 7, 39):
         np.testing.assert_allclose(G[j:, j], pulse[: 40 - j], atol=1e-12)
         assert not G[:j, j].any()
     # A limit within which 0 is no flow, but where the dead zone makes it one.
-    lowest = [course_of(9, u_min=2.0, dead_zone=zone).limits[0] for zone in (0.0, 0.5)]
+    lowest = [plant_of(9, u_min=2.0, dead_zone=zone).limits[0] for zone in (0.0, 0.5)]
     assert lowest == [2.0, 0.0]
 
 
@@ -90,9 +89,9 @@ def test_a_plant_of_first_order_by_hand():
     # y(k+1) = 0.5 y(k) + u(k), |u| <= 1, from 0 to 1.9: full input gives 1, 1.5, 1.75,
     # 1.875, 1.9375; so 1.9 is reached with the fifth. Errors 1.9, 0.9, 0.4, 0.15, 0.025.
     by_hand = [1.9, 0.9, 0.4, 0.15, 0.025]
-    assert change(1.9, 12, **FIRST_ORDER) == pytest.approx(sum(by_hand))
+    assert least_error_sum(1.9, 12, **FIRST_ORDER) == pytest.approx(sum(by_hand))
     # A time as long as the delay leaves no choice.
-    assert change(5.0, 19) == pytest.approx(95.0)
+    assert least_error_sum(5.0, 19) == pytest.approx(95.0)
 
 
 class TestProgramme:
@@ -153,7 +152,7 @@ class TestProgramme:
 
 class TestUnknown:
     def test_the_variance_begins_with_the_episode(self):
-        variance = noise_variance(course_of(60, noise_variance=0.5))
+        variance = noise_variance(plant_of(60, noise_variance=0.5))
         assert variance[0] == 0.0  # y(0) = 0
         assert variance[1] == pytest.approx(0.5)  # xi(1)
         assert variance[2] == pytest.approx(0.5 * (1 + (0.45181 - 0.35740) ** 2))
@@ -169,9 +168,9 @@ class TestUnknown:
         ahead = np.array([ahead, 0.81 * 0.4 * 0.7 / (0.4 + 0.7) + 0.4])
         for _ in range(4):
             ahead = 0.81 * ahead + 0.4
-        variance = noise_variance(course_of(200, **plant, **noise))
+        variance = noise_variance(plant_of(200, **plant, **noise))
         assert variance[[-1, 6]] == pytest.approx(ahead, rel=1e-6)
-        assert variance[-1] > noise_variance(course_of(200, **plant, noise_variance=0.4))[-1]
+        assert variance[-1] > noise_variance(plant_of(200, **plant, noise_variance=0.4))[-1]
 
     @pytest.mark.parametrize(("k", "R"), [(603, 0.0), (609, 0.3)])  # two changes, and one
     def test_the_load_against_many_draws(self, k, R, rng):
@@ -179,7 +178,7 @@ class TestUnknown:
             "disturbance_amplitude": 3.0, "disturbance_interval": 25.0,
             "disturbance_walk_variance": 0.02,
         }  # fmt: skip
-        bound = error_bounds(course_of(620, noise_variance=R, **load))
+        bound = error_bounds(plant_of(620, noise_variance=R, **load))
         draws, jump = 40_000, 0.4
         known = rng.uniform(-3.0, 3.0, draws)  # the level at k - d - 1
         level, walk, xi = known, np.zeros(draws), np.zeros((3, draws))
@@ -216,7 +215,7 @@ class TestUnknown:
     def test_the_load_by_hand_where_it_jumps_at_every_change(self):
         # The two new levels U and V within d + 1 samples add a U + b V, whose mean absolute
         # value for b <= a is a / 2 + b^2 / (6 a). The level before them can be made up for.
-        model = course_of(620, disturbance_amplitude=3.0, disturbance_interval=10.0)
+        model = plant_of(620, disturbance_amplitude=3.0, disturbance_interval=10.0)
         latest, earlier = load_changes(model).effects[600:].T
         a, b = np.sort([3.0 * latest, 3.0 * np.maximum(earlier - latest, 0.0)], axis=0)[::-1]
         intercepts = error_bounds(model).intercepts[600:, 0]
@@ -230,8 +229,8 @@ class TestCausal:
         # all lengths and the next level on a grid, and each comes with its mirror image.
         samples, plant = 16, {"a": (1.0, -0.6), "b": (-0.24,), "c": (1.0,), "delay": 0}
         case = {"setpoint": "random", "setpoint_period": 15, "noise_variance": 0.1, **plant}
-        of_plant = course_of(samples, **case)
-        law = SetPointLaw(of_plant, error_bounds(of_plant))
+        model = plant_of(samples, **case)
+        law = SetPointLaw(model, error_bounds(model))
         past = [-4.0] * 3 + [2.0] * 3
         present = len(past) - 1
         age = present - past.index(past[-1])

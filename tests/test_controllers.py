@@ -24,7 +24,7 @@ from tests.verify_bounds import errors
 ACTUATOR = {"u_min": -9.0, "u_max": 14.0, "dead_zone": 4.0}
 # A plant of the other direction, which shows an input sooner.
 OTHER = {**ACTUATOR, "b": [0.0456, 0.00404], "delay": 9}
-IDLE = 5.0  # mean |e| of a valve that is left alone, degC
+IDLE = 5.0  # mean |e| of an idle valve, degC
 
 
 @pytest.fixture(params=ROSTER)
@@ -37,18 +37,19 @@ def member(entry):
     return entry.members()[0]
 
 
-def test_it_is_told_the_plant_that_it_is_made_for(entry, member):
+def test_each_controller_controls_another_plant(entry, member):
     assert entry.knows
     assert entry.searched
     plant = ACTUATOR if "direction" in entry.assumes else OTHER
-    found = run_case(Scenario("other", "", 600, plant), member, 2, SEED).runs["mae"].to_numpy()
+    case = Scenario("other", "", 600, plant)
+    run_errors = run_case(case, member, 2, SEED).runs["mae"].to_numpy()
     if entry.name == "idle":
-        np.testing.assert_allclose(found, IDLE)
+        np.testing.assert_allclose(run_errors, IDLE)
         return
-    assert (found < 0.7 * IDLE).all()
-    if member.learns:  # in service it has learnt before, on this plant
+    assert (run_errors < 0.7 * IDLE).all()
+    if member.learns:  # A controller in service has learnt on this plant before.
         learnt = member.run(plant, 600, 2, SEED, member.in_service(plant, 2, SEED))
-        assert mean_error(learnt).mean() < 0.9 * found.mean()
+        assert mean_error(learnt).mean() < 0.9 * run_errors.mean()
 
 
 def test_a_batch_is_its_members_again_and_mirrored(entry, member):
@@ -97,7 +98,7 @@ def written(tmp_path, monkeypatch):
 
 
 def members_of(*locations):
-    return chosen([], [f"mine={each}" for each in locations])["mine"].members()
+    return chosen([], [f"mine={location}" for location in locations])["mine"].members()
 
 
 class TestOwnControllers:
@@ -167,9 +168,10 @@ class TestOwnControllers:
 
     def test_the_same_name_again_is_another_training(self, written):
         other = written("from agents import PIController as Mine")
-        found = members_of("agents:PIController", other)
-        assert [each.provenance["file"] for each in found] == ["agents:PIController", other]
-        assert errors(found[0], 1, 60, setpoint_window=7) == errors(found[0], 1, 60)
+        members = members_of("agents:PIController", other)
+        files = [member.provenance["file"] for member in members]
+        assert files == ["agents:PIController", other]
+        assert errors(members[0], 1, 60, setpoint_window=7) == errors(members[0], 1, 60)
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ def make(num_envs=2, **arguments):
 def signals_of(envs, seed, *, episodes, samples):
     """Return signals and plant numbers of an environment in NumPy, as external signals."""
     parameters, n = envs.parameters, envs.num_envs
-    signals, ranges = Signals.of(parameters, n, samples), PlantSampler(parameters)
+    signals, sampler = Signals.of(parameters, n, samples), PlantSampler(parameters)
     streams = [RandomStreams.of_seed(seed + i) for i in range(n)]
     values_by_name = defaultdict(list)
     for _ in range(episodes):

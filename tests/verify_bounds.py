@@ -1,6 +1,7 @@
-"""Run every controller against its bound: `python -m tests.verify_bounds`, twenty minutes.
+"""Compare the error of every controller with the bounds: `python -m tests.verify_bounds`.
 
-Nothing was tuned on these cases. The output is in benchmarks/published/bounds_verified.txt.
+No controller was tuned on the cases of this module. The command takes twenty minutes. The
+output is in benchmarks/published/bounds_verified.txt.
 """
 
 import numpy as np
@@ -21,7 +22,8 @@ from mptc_gym.plant.dynamics import action_from_command
 RUNS = 300
 SAMPLES = 1200  # of a run
 ODD = {"delay": 30, "u_min": -12.0, "u_max": 6.0, "dead_zone": 4.0, "setpoint_amplitude": 3.0}
-RANDOM, NOISE = {"setpoint": "random"}, {"noise_variance": 0.5}
+RANDOM = {"setpoint": "random"}
+NOISE = {"noise_variance": 0.5}
 PERIODS = 20, 38, 40, 76, 100, 152, 160, 200, 320  # samples
 SQUARE_WAVES = {
     f"square, held {period / 2:g}": {"setpoint_period": period} for period in PERIODS
@@ -42,13 +44,15 @@ CASES = {
 
 
 class Counting:
-    """Apply the flow that holds the set point of d + 10 samples ahead in a square wave.
+    """A controller that knows when a square wave changes.
 
-    On other set points it applies the flow that holds the present set point.
+    The flow at sample k is the flow that holds the set point of the sample k + d + 10, where d
+    is the delay. If the set point is no square wave, the flow holds the present set point.
     """
 
     def __init__(self, parameters, **_):
-        self.plant, self.gain = parameters, nominal(parameters).gain
+        self.plant = parameters
+        self.gain = nominal(parameters).gain
         self.limits = [np.mean(parameters.range_of(name)) for name in ("u_min", "u_max")]
 
     def reset(self):
@@ -76,15 +80,16 @@ CONTROLLERS["counting"] = COUNTING
 
 
 def errors(controller, runs, samples, **arguments):
-    """Return mean |e| of runs with seeds from `SEED` on, degC, shape (runs,)."""
+    """Return the mean |e| of runs with the seeds from `SEED` on, degC, shape (runs,)."""
     return mean_error(controller.run(arguments, samples, runs, SEED))
 
 
 def beats(run_errors, least):
-    """Return whether the mean errors of runs, degC, shape (runs,), beat a bound.
+    """Return whether the mean errors of runs, degC, shape (runs,), are smaller than a bound.
 
-    They do if the interval of the difference from the bound lies below 0. Where the bound has a
-    term for each run, a run is compared with its own term.
+    The errors are smaller if the confidence interval of the difference from the bound lies
+    below 0. If each episode has its own bound, each run is compared with the bound of its
+    episode.
     """
     bounds = np.full(len(run_errors), least.value)
     if len(least.episodes) == len(run_errors):
@@ -94,7 +99,8 @@ def beats(run_errors, least):
 
 def main(runs=RUNS):
     """Print the bound of each case and each controller's mean error, degC."""
-    rows, beaten = [], []
+    rows = []
+    beaten = []
     for case, arguments in CASES.items():
         kind = "causal" if arguments.get("setpoint") == "random" else "preview"
         least = least_possible(samples=SAMPLES, kind=kind, episodes=runs, **arguments)

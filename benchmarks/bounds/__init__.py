@@ -1,10 +1,10 @@
-"""Compute least possible mean errors: lower bounds for every controller, and a reference."""
+"""Compute lower bounds of the mean error of every controller, and a reference error."""
 
 from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """Import `least_possible` on its first use, as SciPy loads more slowly than a help text."""
+    """Import `least_possible` on its first use, as importing SciPy would delay `--help`."""
     if name != "least_possible":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from benchmarks.bounds.least import least_possible

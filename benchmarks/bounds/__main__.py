@@ -163,55 +163,43 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
 def write_package(fan_out: FanOut) -> str:
     """Write the file of least possible errors that ships with the package `mptc_gym`.
 
-    Each case of `PACKAGED` gets a list "least", the bounds of the episodes of a published
-    score, degC. The list has a single number if all episodes have the same bound. If the bounds
-    differ, the case gets a second list, "validation_least", the bounds of the episodes on which
-    policies are selected.
-
-    Parameters
-    ----------
-    fan_out
-        Runs the cases in parallel.
-
-    Returns
-    -------
-    str
-        The closing line of the command.
+    `fan_out` runs the cases in parallel. The closing line of the command is returned.
     """
-    from benchmarks.bounds.least import least_possible
-
-    published: dict[str, Any] = {"seed": SEED, "episodes": PACKAGED_EPISODES}
-    validation: dict[str, Any] = {"seed": VALIDATION_SEED, "episodes": VALIDATION_EPISODES}
-    tasks = {
-        name: partial(least_possible, samples=SAMPLES, **published, **arguments)
-        for name, arguments in PACKAGED.items()
-    }
-    bounds = dict(fan_out.stream(tasks, "bounds"))
-    validation_tasks = {
-        name: partial(least_possible, samples=SAMPLES, **validation, **arguments)
-        for name, arguments in PACKAGED.items()
-        if len(bounds[name].episodes) > 1
-    }
-    validation_bounds = dict(fan_out.stream(validation_tasks, "validation bounds"))
-    cases: dict[str, dict[str, Any]] = {}
-    for name, arguments in PACKAGED.items():
-        bound = bounds[name]
-        cases[name] = {"arguments": arguments, "kind": bound.kind, "least": bound.episodes}
-        if name in validation_bounds:
-            cases[name]["validation_least"] = validation_bounds[name].episodes
+    tasks = {name: partial(packaged_case, arguments) for name, arguments in PACKAGED.items()}
+    cases = dict(fan_out.stream(tasks, "bounds"))
     content = {
         "command": "python -m benchmarks.bounds --package",
         "commit": commit(),
         "versions": versions(),
         "unit": "degC, mean of |e(k)| over k = 1 to samples",
         "samples": SAMPLES,
-        **published,
+        "seed": SEED,
+        "episodes": PACKAGED_EPISODES,
         "validation_seed": VALIDATION_SEED,
         "validation_episodes": VALIDATION_EPISODES,
-        "cases": cases,
+        "cases": {name: cases[name] for name in PACKAGED},
     }
     write_json(PACKAGE_FILE, content)
     return f"Written to {PACKAGE_FILE}"
+
+
+def packaged_case(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the entry of a case in the file of least possible errors.
+
+    The list "least" has the bounds of the episodes of a published score, degC, or a single
+    number if all episodes have the same bound. If the bounds differ, the list
+    "validation_least" has the bounds of the episodes on which policies are selected.
+    `arguments` are the arguments of the environment.
+    """
+    from benchmarks.bounds.least import least_possible
+
+    least = partial(least_possible, samples=SAMPLES, **arguments)
+    published = least(seed=SEED, episodes=PACKAGED_EPISODES)
+    entry = {"arguments": arguments, "kind": published.kind, "least": published.episodes}
+    if len(published.episodes) > 1:
+        validation = least(seed=VALIDATION_SEED, episodes=VALIDATION_EPISODES)
+        entry["validation_least"] = validation.episodes
+    return entry
 
 
 main = command("bounds", Options, work)

@@ -5,9 +5,9 @@ known distribution. The *levels*, the values between changes, are independent an
 distributed in [-A, A]. The number of samples for which a level lasts is uniformly distributed
 from S to L. The *age* of a level is the number of samples since the level began.
 
-A controller without preview learns of a change of the set point when the change happens. So the
-flow u_a(j) depends only on the set points up to j. For every price pi(j) of the flow with
-E[pi(j) | set points up to j] = 0, it follows that
+A controller without preview learns of a change of the set point when the change happens, so the
+flow u_a(j) of the controller depends only on the set points up to j. For every price pi(j) of
+the flow with E[pi(j) | set points up to j] = 0, it follows that
 
     E[sum_j pi(j) u_a(j)] = 0.
 
@@ -22,10 +22,10 @@ choice of pi in this module is
     pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
 
 G[k, j] is the effect of the flow u_a(j) on the output y(k). The *slope* g(k) is a rough
-estimate of how fast E|e(k)| rises with the expected error at k, in degC per degC. A formula
-gives the conditional means of g(k). After a change of the set point, g is the sign of the
-change until the output can have reached the new level. Then g is a number between -1 and 1,
-which weighs staying at the present level against moving towards 0, the mean of the next level.
+estimate of how fast E|e(k)| rises with the expected error at k, in degC per degC. After a
+change of the set point, g is the sign of the change until the output can have reached the new
+level. Then g is a number between -1 and 1, which weighs staying at the present level against
+moving towards 0, the mean of the next level.
 """
 
 import numpy as np
@@ -106,13 +106,15 @@ class SetPointLaw:
         self._impulse = at_start.impulse_response(samples + zeros)[zeros:]
 
     def penalty(self, setpoint: Array) -> Array:
-        """Return the prices pi(j) of the flows u_a(j), degC per t/h, shape (samples,).
+        """Return the prices of the flows in one episode, degC per t/h, shape (samples,).
 
-        `setpoint` holds the set points y_d(k) of one episode, degC, shape (samples,).
+        The price of the flow at sample j is pi(j) in the description of the module. `setpoint`
+        holds the set points of the episode, degC, shape (samples,).
         """
         samples = len(setpoint)
         slope = np.zeros(samples)  # g(k)
-        expected = np.zeros((samples, samples))  # [k, j]: E[g(k) | set points up to j]
+        # Row k, column j: the conditional mean of g(k), given the set points up to j.
+        expected = np.zeros((samples, samples))
         previous_level = 0.0  # before the episode
         for start, end in held(setpoint):
             level = setpoint[start]
@@ -120,7 +122,7 @@ class SetPointLaw:
             slope_if_held = self._slope_after_change(previous_level, level)
             slope_if_held += self._slope_after_arrival(change_sums)
             slope[start:end] = slope_if_held[: end - start]
-            for j in range(start, end):
+            for j in range(start, end):  # The age of the level is j - start.
                 later_ages = np.arange(j + 1 - start, samples - start)
                 expected[j + 1 :, j] = self._expected_slope(
                     later_ages, j - start, slope_if_held, change_sums
@@ -137,23 +139,23 @@ class SetPointLaw:
         slope_if_held: Array,
         change_sums: Array,
     ) -> Array:
-        """Return the conditional means of the slope g, given that a level has reached an age.
+        """Return the mean slopes of the error, given that a level has reached an age.
 
         Parameters
         ----------
         ages
-            Ages of the level at which g is wanted, samples, all above `known_age`.
+            Ages of the level at which the means are wanted, samples, all above `known_age`.
         known_age
             Age up to which the level is known not to change, samples.
         slope_if_held
-            The slope g by age if the level never changes, shape (samples,).
+            The slope by age if the level never changes, shape (samples,).
         change_sums
             What `_sums_after_next_change` returns for the level.
 
         Returns
         -------
         ndarray
-            The conditional means of g, in the shape of `ages`.
+            The conditional means of the slope, in the shape of `ages`.
         """
         # The next level begins at an age from `first` to `longest`, all equally probable.
         first = max(self._shortest, known_age + 1)
@@ -164,7 +166,10 @@ class SetPointLaw:
         return expected
 
     def _slope_after_change(self, previous_level: float, level: float) -> Array:
-        """Return the slope g after a change of the set point, by age, shape (samples,).
+        """Return the slopes of the error after a change of the set point, shape (samples,).
+
+        Element i is the slope at the age i of the new level: an estimate of how fast the mean
+        absolute error rises with the expected error, from -1 to 1.
 
         The set point changes from `previous_level` to `level`, degC. The slope is the sign of
         the change times the probability that the error is larger than the noise. The slope is 0
@@ -195,7 +200,7 @@ class SetPointLaw:
         return mean
 
     def _sums_after_next_change(self, level: float) -> Array:
-        """Return cumulative sums of the mean slope g after the next change from `level`, degC.
+        """Return cumulative sums of the mean slopes after the next change from `level`, degC.
 
         The element `longest + 1 + i` is the sum over the samples from the change to i samples
         after the change. The first `longest + 1` elements, for samples before the change, are
@@ -206,12 +211,12 @@ class SetPointLaw:
         return np.append(np.zeros(self._longest + 1), np.cumsum(mean_slope))
 
     def _slope_after_arrival(self, change_sums: Array) -> Array:
-        """Return the slope g at ages after the output's arrival, by age, shape (samples,).
+        """Return the slopes of the error after the output has arrived at a level, by age.
 
-        The slopes solve one equation for each age: an additional flow that acts from this age
-        on does not change the expected error. So the sum over later ages of the impulse
-        response times the mean of g is 0. The highest age comes first. `change_sums` is what
-        `_sums_after_next_change` returns.
+        The slopes solve an equation for each age: an additional flow that acts from the age on
+        does not change the mean error. So the sum of the impulse response times the mean slopes
+        is 0. The equation of the highest age is solved first. `change_sums` is what
+        `_sums_after_next_change` returns for the level.
         """
         samples = len(self._probability_held)
         slope = np.zeros(samples)

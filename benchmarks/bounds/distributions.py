@@ -107,7 +107,7 @@ def reduced(distribution: Distribution, atoms: int) -> Distribution:
 
 
 def least_mean_distances(distribution: Distribution, slopes: Array) -> Array:
-    """Return the minimum over x of E|x - n| - s x for each slope s and each sample, degC.
+    """Return the minimum over all x of E|x - n| - s x for each slope s and each sample, degC.
 
     Parameters
     ----------
@@ -132,7 +132,8 @@ def least_mean_distances(distribution: Distribution, slopes: Array) -> Array:
     minima = np.empty((samples, len(slopes)))
     for i, slope in enumerate(slopes):
         # The minimum is at the quantile of probability (1 + s) / 2. As sums are rounded, the
-        # quantile may be its neighbour, where E|x - n| - s x is as small.
+        # quantile may be its neighbour, where E|x - n| - s x is as small. If x is a value of n,
+        # then E|x - n| = mean - 2 partial_mean + (2 probability - 1) x.
         is_below = probability < (1.0 + slope) / 2.0 - ROUNDING
         quantile = np.minimum(is_below.sum(axis=1), atoms - 1)
         x = values[k, quantile]

@@ -54,7 +54,7 @@ KINDS = "preview", "causal", "reference"
 class LeastPossible(Estimate):
     """The least possible mean |e| of a case, degC, with a 95 % interval over random episodes.
 
-    If the least error is the same in all episodes, `low` and `high` equal `value`.
+    The interval has the length 0 if the least error is the same in all episodes.
     """
 
     kind: str  # one of `KINDS`
@@ -141,7 +141,7 @@ def least_possible(
         return _bound(*case, kind)
     if has_random_setpoint:
         return _bound(*case, "causal")
-    setpoint = _draw(parameters, samples, 1, seed).setpoints[0]
+    setpoint = _episodes_of(parameters, samples, 1, seed).setpoints[0]
     if np.ptp(setpoint) == 0.0:  # Without a change, foresight makes no difference.
         return _bound(*case, "preview")
     try:
@@ -151,28 +151,22 @@ def least_possible(
 
 
 def with_hidden_load(
-    *,
-    samples: int,
-    kind: str | None = None,
-    episodes: int = EPISODES,
-    seed: int = SEED,
-    **arguments: Any,
+    *, samples: int, episodes: int = EPISODES, seed: int = SEED, **arguments: Any
 ) -> Estimate:
     """Return an estimate of the least possible mean |e(k)| if nobody measures the load, degC.
 
     The estimate is not a bound: see `hidden.py`. For a case without a load, the result is the
     least possible error. `least_possible` describes the parameters and exceptions.
     """
-    least = least_possible(
-        samples=samples, kind=kind, episodes=episodes, seed=seed, **arguments
-    )
+    least = least_possible(samples=samples, episodes=episodes, seed=seed, **arguments)
     parameters = Parameters(**arguments)
     if not parameters.is_disturbed:
         return least
-    drawn = _draw(parameters, samples, len(least.episodes), seed)
+    sampled = _episodes_of(parameters, samples, len(least.episodes), seed)
     estimates = []
     for i, bound in enumerate(least.episodes):
-        episode = parameters, least.kind, drawn.numbers[i], drawn.setpoints[i]
+        # The first arguments of `_error_sum`.
+        episode = parameters, least.kind, sampled.numbers[i], sampled.setpoints[i]
         hidden_load = _error_sum(*episode, bounds_with_hidden_load)
         known_load = _error_sum(*episode, bounds_with_known_load)
         estimates.append(bound + (hidden_load - known_load) / samples)
@@ -188,8 +182,11 @@ class _Episodes(NamedTuple):
     idle_errors: Array
 
 
-def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
-    """Return the environment's episodes with the seeds `seed`, `seed + 1` and so on."""
+def _episodes_of(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
+    """Return the plants, set points and idle-valve errors of the environment's episodes.
+
+    An episode has the samples k = 0 to `samples`, and episode i has the seed `seed + i`.
+    """
     numbers = drawn_numbers(parameters, episodes, seed)
     with closing(make_plants(episodes, samples + 1, **asdict(parameters))) as plants:
         idle_valve = IdleValve(numbers.u_min, numbers.u_max)
@@ -205,22 +202,23 @@ def _draw(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Ep
 def _bound(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
-    """Return the least possible error for one of `KINDS`; a NoBoundError is raised without one.
+    """Return the least possible error of one of `KINDS`.
 
-    `least_possible` describes the parameters.
+    `least_possible` describes the parameters. A NoBoundError is raised if the reference does
+    not exist.
     """
     if not is_random(parameters):
         episodes = 1
-    drawn = _draw(parameters, samples, episodes, seed)
+    sampled = _episodes_of(parameters, samples, episodes, seed)
     bounds = episodes
     if not (parameters.ranges or parameters.setpoint == "random"):
         bounds = 1  # Noise and load do not change the bound.
     values = []
     for i in range(bounds):
-        error_sum = _error_sum(parameters, kind, drawn.numbers[i], drawn.setpoints[i])
+        error_sum = _error_sum(parameters, kind, sampled.numbers[i], sampled.setpoints[i])
         # Rounded to be the same on all machines, as solvers differ in later digits.
         values.append(round(error_sum / samples, 6))
-    idle = student(drawn.idle_errors)
+    idle = student(sampled.idle_errors)
     return LeastPossible(**vars(student(values)), kind=kind, idle=idle, episodes=tuple(values))
 
 

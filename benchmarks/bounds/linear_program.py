@@ -62,7 +62,7 @@ class ErrorBounds:
         """For each line, the length of the interval on which the line is the highest, degC.
 
         The intervals divide the magnitudes of the expected error from 0 to infinity. The
-        interval of the last line is infinitely long. The shape is (samples, slopes).
+        lengths have the shape (samples, slopes), and the last length is infinite.
         """
         ends = np.full(self.intercepts.shape, np.inf)
         corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
@@ -77,9 +77,9 @@ def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
     an episode from rest. The matrix equation is equation (28) of the paper. Both matrices are
     sparse and have the shape (samples, samples).
     """
-    past_outputs = _lagged(model.alpha[:samples], 1)
-    past_flows = _lagged(model.beta[:samples], int(model.numbers.delay) + 1)
-    return (scipy.sparse.eye_array(samples) - past_outputs).tocsr(), past_flows
+    A = scipy.sparse.eye_array(samples) - _lagged(model.alpha[:samples], 1)
+    B = _lagged(model.beta[:samples], int(model.numbers.delay) + 1)
+    return A.tocsr(), B
 
 
 def _lagged(coefficients: Array, lag: int) -> Any:
@@ -88,6 +88,7 @@ def _lagged(coefficients: Array, lag: int) -> Any:
     `coefficients` has the shape (samples, order), and the matrix (samples, samples).
     """
     samples, order = coefficients.shape
+    # An element of a diagonal is placed by its column, so the transpose places it by its row.
     diagonals = coefficients.T, lag + np.arange(order)
     return scipy.sparse.dia_array(diagonals, shape=(samples, samples)).T.tocsr()
 
@@ -312,13 +313,14 @@ def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
     n = len(program.flows.cost)
     rows = len(program.targets)
     eye = scipy.sparse.eye_array(n)
-    differences = eye - scipy.sparse.eye_array(n, k=-1)
+    differences = eye - scipy.sparse.eye_array(n, k=-1)  # flow k minus flow k - 1
     slopes = len(program.pieces.cost) // (2 * n)
-    # The columns of the variables in the rows of the targets.
+    # Columns of the matrix in the rows of the targets: outputs and pieces stand in the first n
+    # rows; flows and moves stand in the next n rows, which only a quiet plan has.
     output_columns = scipy.sparse.eye_array(rows, n)
     flow_columns = scipy.sparse.eye_array(rows, n, k=-n, format="csr") @ differences
     piece_columns = scipy.sparse.hstack([eye, -eye] * slopes)
-    if rows > n:  # a quiet plan, with moves after the pieces
+    if rows > n:  # The columns of the moves follow those of the pieces.
         move_columns = scipy.sparse.hstack([-eye, eye])
         piece_columns = scipy.sparse.block_diag([piece_columns, move_columns])
     if with_outputs:

@@ -56,10 +56,10 @@ def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
     Parameters
     ----------
     F, Q
-        x(k) = F(k) x(k-1) + v(k), where x(0) = 0 and v(k) is white with the covariance Q(k).
-        Both have the shape (samples, size, size).
+        Matrices of x(k) = F(k) x(k-1) + v(k), shape (samples, size, size), where x(0) = 0 and
+        v(k) is white with the covariance Q(k).
     reading_variance
-        A reading is the first element of x(k) plus white noise with this variance, degC^2.
+        Variance of the white noise in a reading of the first element of x(k), degC^2.
 
     Returns
     -------
@@ -84,8 +84,8 @@ def predicted_variance(filtered: Array, F: Array, Q: Array, lag: int) -> Array:
     filtered
         Covariances of the state x(k), given the readings up to k, shape (samples, size, size).
     F, Q
-        x(k) = F(k) x(k-1) + v(k), where v(k) is white with the covariance Q(k). The first
-        element of x(k) is y(k).
+        Matrices of x(k) = F(k) x(k-1) + v(k), shape (samples, size, size), where v(k) is white
+        with the covariance Q(k). The first element of x(k) is y(k).
     lag
         Number of samples to predict ahead.
 

@@ -6,8 +6,8 @@ the right side. The load is the sum of a random walk and of a piecewise constant
 changes are called *jumps*.
 
 A flow at sample j affects the output y(j + d + 1) at the earliest. So no flow counteracts the
-effects on y(k) of noise, walk and jumps after the sample k - d - 1. Let n(k) be the sum of
-these effects, degC, and m(k) the error that there would be if n(k) were 0. The error is
+effects on y(k) of noise, walk and jumps after the sample k - d - 1. Let n(k) be the sum of the
+effects that no flow counteracts, degC, and m(k) the error if n(k) were 0. The error is
 
     e(k) = m(k) - n(k).
 
@@ -113,8 +113,8 @@ def error_bounds(model: LinearModel) -> ErrorBounds:
 def bounds_for_normal(variance: Array) -> ErrorBounds:
     """Return the lower bounds of the mean errors if the inevitable errors are normal.
 
-    `variance` holds the variance of the part of the error that no flow can counteract in time,
-    degC^2, for each sample, shape (samples,). This part has the mean 0.
+    `variance` holds the variance of the inevitable error, which no flow can counteract in time,
+    degC^2, for each sample, shape (samples,). The inevitable error has the mean 0.
     """
     if not variance.any():
         return ErrorBounds(np.ones(1), np.zeros((len(variance), 1)))
@@ -134,7 +134,7 @@ class LoadChanges(NamedTuple):
     # (samples, largest number of unknown changes).
     effects: Array
     counts: NDArray[np.intp]  # the number of unknown changes, shape (samples,)
-    earlier: NDArray[np.intp]  # the number of changes up to k - d - 1, shape (samples,)
+    known_counts: NDArray[np.intp]  # the number of changes up to k - d - 1, shape (samples,)
 
 
 def load_changes(model: LinearModel) -> LoadChanges:
@@ -145,20 +145,20 @@ def load_changes(model: LinearModel) -> LoadChanges:
     samples = len(model.load)
     k = np.arange(samples)
     times = np.arange(0, samples, LOAD_INTERVAL)
-    age = k[:, np.newaxis] - times  # samples since each time
+    ages = k[:, np.newaxis] - times  # samples from each time to k
     # Row k, column i: the effect on y(k), degC, of a change of the load by 1 degC at times[i].
     # The load does not change at the first time, k = 0.
-    steps = model.load[:, np.newaxis] * (age >= 0) * (times > 0)
+    steps = model.load[:, np.newaxis] * (ages >= 0) * (times > 0)
     A, _ = equations(model, samples)
     responses = scipy.sparse.linalg.spsolve_triangular(A, steps)
-    responses[age >= model.lag] = 0.0  # The change is known in time.
-    latest = k // LOAD_INTERVAL
-    earlier = np.maximum(k - model.lag, 0) // LOAD_INTERVAL
+    responses[ages >= model.lag] = 0.0  # A flow counteracts these changes in time.
+    changes = k // LOAD_INTERVAL  # number of changes up to k
+    known_changes = np.maximum(k - model.lag, 0) // LOAD_INTERVAL
     largest_count = math.ceil(min(model.lag, samples) / LOAD_INTERVAL)
     effects = np.empty((samples, largest_count))
-    for place in range(largest_count):
-        effects[:, place] = responses[k, np.maximum(latest - place, 0)]
-    return LoadChanges(effects, latest - earlier, earlier)
+    for place in range(largest_count):  # place 0 is the latest change
+        effects[:, place] = responses[k, np.maximum(changes - place, 0)]
+    return LoadChanges(effects, changes - known_changes, known_changes)
 
 
 def _after_jumps(
@@ -267,12 +267,14 @@ def _intercepts_with_jumps(
     both_signs = np.append(SLOPES, -SLOPES)
     half = KNOWN_LEVEL_ATOMS // 2
     levels = [0.0, *(amplitude * (np.arange(half) + 0.5) / half)]
-    never_jumped = (1.0 - jump_probability) ** changes.earlier  # probability
+    never_jumped = (1.0 - jump_probability) ** changes.known_counts  # probability
     probabilities = [never_jumped] + [(1.0 - never_jumped) / half] * half
     intercepts = np.zeros((len(changes.counts), len(SLOPES)))
     for level, probability in zip(levels, probabilities, strict=True):
         values = at_level_0.values + level * effect_of_level
         distribution = Distribution(values, at_level_0.weights)
-        by_sign = least_mean_distances(distribution, both_signs).reshape(len(values), 2, -1)
-        intercepts += probability[:, np.newaxis] * by_sign.mean(axis=1)
+        minima = least_mean_distances(distribution, both_signs)
+        # Row 0 of each sample is for the level l, and row 1 for the level -l.
+        at_both_levels = minima.reshape(len(values), 2, -1)
+        intercepts += probability[:, np.newaxis] * at_both_levels.mean(axis=1)
     return intercepts

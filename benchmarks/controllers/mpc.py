@@ -1,8 +1,8 @@
 """Control the plant by model predictive control (MPC), with an exact model of the plant.
 
 The controller knows all parameters of the plant, the noise and the load, but neither future
-noise and loads nor future set points. The mean error of the controller shows how close a
-controller can come to the error bounds of `benchmarks.bounds`.
+noise and loads nor future set points. The mean error of the controller shows how close to the
+bounds of `benchmarks.bounds` an error can be.
 """
 
 from dataclasses import dataclass
@@ -39,10 +39,10 @@ class _Model:
         The plants of all runs.
     response : Array
         The matrix G, shape (n, HORIZON, HORIZON), degC per t/h. G times the planned flows is
-        the change of the first HORIZON outputs that can depend on the planned flows.
+        the effect of the flows on the first HORIZON outputs that the flows can affect.
     hessian : Array
         The transpose of G times G, shape (HORIZON, HORIZON, n). The axis of the runs is last,
-        as operations on all runs are faster in this order.
+        because operations on all runs are faster in this order.
     curvature : Array
         The second derivative of the cost by each planned flow, shape (HORIZON, n). A flow that
         affects no output within the horizon has the curvature `SMALLEST_CURVATURE`, not 0.
@@ -55,10 +55,10 @@ class _Model:
 
     @classmethod
     def of(cls, plants: LinearModel) -> "_Model":
-        """Return the model of `plants`, the plants of all runs at one sample."""
+        """Return the model of n plants at one sample."""
         impulse_response = plants.impulse_response(HORIZON)
         response = np.zeros((len(impulse_response), HORIZON, HORIZON))
-        for j in range(HORIZON):
+        for j in range(HORIZON):  # Flow j affects the outputs from output j on.
             response[:, j:, j] = impulse_response[:, : HORIZON - j]
         products = response.transpose(0, 2, 1) @ response
         hessian = np.ascontiguousarray(products.transpose(1, 2, 0))
@@ -93,17 +93,16 @@ class PredictiveController:
     transmitter's readings. The load jumps and is not normally distributed, so the Kalman filter
     is the best linear filter, but not the best filter.
 
-    The score depends on the mean of |e|, the absolute error, which is least if the median of
-    the output is at the set point. So the expected outputs are medians, and the load is
-    expected to stay as it is. The planned flows minimise the sum of squared differences between
+    The mean absolute error is least if the median of the output is at the set point. So the
+    expected outputs are medians, and the load is expected to stay as it is. The planned flows
+    lie within the limits of the actuator, and minimise the sum of squared differences between
     expected outputs and target outputs. The sum has HORIZON outputs, from the first output on
-    that can depend on the planned flows. All planned flows lie within the limits of the
-    actuator. If the first planned flow lies inside the dead zone, the flow becomes 0 or the
-    flow at the edge of the dead zone, whichever gives the smaller sum.
+    that the planned flows can affect. If the first planned flow lies inside the dead zone, the
+    flow becomes 0 or the flow at the edge of the dead zone, whichever gives the smaller sum.
 
-    The target outputs are equal to the present set point, as if the set point never changed.
-    But if set points are random, the controller computes from the time since the latest change
-    how likely a change within the delay is, and `agents.hedge` chooses the target outputs.
+    If set points are not random, the target outputs are equal to the present set point. If set
+    points are random, the controller computes from the time since the latest change how likely
+    a change within the delay is, and `agents.hedge` chooses the target outputs.
 
     Parameters
     ----------
@@ -193,10 +192,11 @@ class PredictiveController:
         return action[:, np.newaxis]
 
     def _targets(self, setpoint: Array) -> Array:
-        """Return the target outputs, degC, shape (runs, HORIZON); called once a sample.
+        """Return the target outputs, degC, shape (runs, HORIZON), and note the set points.
 
-        Column i has the target of the output that the planned flow i is the first to affect.
-        `setpoint` has the present set points, degC, shape (runs,).
+        Column i has the target of the first output that the planned flow i can affect.
+        `setpoint` has the present set points, degC, shape (runs,). The method must be called
+        once a sample.
         """
         if self._random is None:
             return np.broadcast_to(setpoint[:, np.newaxis], (len(setpoint), HORIZON))
@@ -212,8 +212,8 @@ class PredictiveController:
         """Return the standard deviation of the forecast error of each run, degC, shape (runs,).
 
         The forecast is the expected value of the first output that the next flow can affect.
-        The Kalman filter is taken to have settled, and the plant is taken not to drift. The
-        controller must be reset afterwards.
+        The method leaves the Kalman filter in the state that it has after many samples of a
+        plant that does not drift.
         """
         self.reset()
         plants = self._model(0).plants
@@ -243,9 +243,9 @@ class PredictiveController:
     def _update_covariance(self, F: Array, Q: Array) -> Array:
         """Advance the Kalman filter's covariance by a sample, and return the filter's gain.
 
-        F is the state transition matrix, and Q is the covariance of the process noise, both of
-        shape (runs, size, size), where size is the length of the state. The gain is the factor
-        from the deviation of the reading to the correction of the state, shape (runs, size).
+        The state transition matrices F and the covariances Q of the process noise have the
+        shape (runs, size, size), where size is the length of the state. The gain, of shape
+        (runs, size), multiplies the deviation of a reading from the expected reading.
         """
         P = F @ self._covariance @ F.transpose(0, 2, 1) + Q
         variance = P[:, 0, 0] + self._numbers.measurement_noise_variance
@@ -256,9 +256,9 @@ class PredictiveController:
     def _transition(self, k: int, plants: LinearModel) -> tuple[Array, Array]:
         """Return the matrices F and Q of the Kalman filter for the step from k - 1 to k.
 
-        F is the state transition matrix, and Q is the covariance of the process noise, both of
-        shape (runs, size, size), where size is the length of the state. `plants` has the
-        plants of all runs at sample k.
+        The state transition matrices F and the covariances Q of the process noise have the
+        shape (runs, size, size), where size is the length of the state. `plants` has the plants
+        of all runs at sample k.
         """
         stays = self._load_stays
         variances = self._variances
@@ -271,8 +271,8 @@ class PredictiveController:
     def _predict(self) -> Array:
         """Return the outputs that are expected if all flows from the present sample k on are 0.
 
-        Column i has the outputs y(k + 1 + i), degC, of all runs. The shape is
-        (runs, longest delay + HORIZON).
+        The outputs are in degC. Column i has the outputs y(k + 1 + i) of all runs, and there
+        are as many columns as the longest delay plus HORIZON.
         """
         runs = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
         flows = self._flows[runs, self._flow_columns[:, 1:]]
@@ -312,12 +312,12 @@ class PredictiveController:
         """Return a plan whose first flow the actuator can apply, and the command for this flow.
 
         A first flow inside the dead zone is replaced by 0 or by the flow at the edge of the
-        dead zone, whichever has the lower cost, and the later flows are planned anew.
+        dead zone, and the later flows are planned anew. The plan with the lower cost is chosen.
 
         Parameters
         ----------
         model, slopes
-            The plants, and the second argument of `_Model.cost`.
+            The plants, and the argument `slopes` of `_Model.cost`.
         plan
             The planned flows, t/h, shape (HORIZON, runs).
 
@@ -350,19 +350,20 @@ class PredictiveController:
         start: Array,
         first_flow: Array | float | None = None,
     ) -> Array:
-        """Return the planned flows with the least cost, t/h, shape (HORIZON, runs).
+        """Return the plan with the least cost within the limits of the actuator.
 
-        The flows lie within the limits of the actuator. The method is coordinate descent.
+        The plan is found by coordinate descent. It has the planned flows, t/h, shape (HORIZON,
+        runs).
 
         Parameters
         ----------
         model, slopes
-            The plants, and the second argument of `_Model.cost`.
+            The plants, and the argument `slopes` of `_Model.cost`.
         start
             The planned flows with which the descent starts, t/h, shape (HORIZON, runs).
         first_flow
-            A fixed value of the first planned flow, t/h, shape (runs,) or one number for all
-            runs; None if the first flow is chosen like all other flows.
+            A fixed value of the first planned flow, t/h, shape (runs,), or a number for all
+            runs; None if the first flow is planned, too.
         """
         plan = start.copy()
         free_flows = range(HORIZON)

@@ -31,9 +31,9 @@ Spans = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class PlantScale:
-    """Magnitudes of a plant, to which the gains of controllers are proportional.
+    """Quantities of a plant, from which the size of a controller's gains follows.
 
-    If the plant is integrating, all but the delay are infinite.
+    If the plant is integrating, all quantities except the delay are infinite.
     """
 
     gain: float  # magnitude of the steady-state gain, degC per t/h
@@ -57,7 +57,7 @@ def direction(plant: Parameters) -> int:
 
 
 def scale_of(plant: Parameters) -> PlantScale:
-    """Return the magnitudes of the nominal plant, which is in the middle of all ranges."""
+    """Return the scale of the nominal plant, in the middle of all ranges of `plant`."""
     model = nominal(plant)
     gain = abs(float(model.gain))
     half_range = (model.numbers.u_max - model.numbers.u_min) / 2.0  # t/h
@@ -66,14 +66,19 @@ def scale_of(plant: Parameters) -> PlantScale:
         time_constant = math.inf
     elif model.slowest_pole > 0.0:
         time_constant = -1.0 / math.log(model.slowest_pole)
-    return PlantScale(gain, gain * half_range, time_constant, model.numbers.delay + 1.0)
+    return PlantScale(
+        gain=gain,
+        temperature_range=gain * half_range,
+        time_constant=time_constant,
+        delay=model.numbers.delay + 1.0,
+    )
 
 
 def difference(plant: Parameters, made_for: Parameters) -> str:
-    """Return a text on the quantities of two plants that differ by a factor above 2.
+    """Return a text with the quantities in which two plants differ by more than a factor 2.
 
-    An example is "the delay is 41 samples in place of 19". The text is "" if the plants do not
-    differ by so much.
+    An example is "the delay is 41 samples in place of 19". The text is "" if all quantities
+    differ by at most a factor 2.
 
     Parameters
     ----------
@@ -94,10 +99,10 @@ def difference(plant: Parameters, made_for: Parameters) -> str:
 
 
 def _finite_scale_of(plant: Parameters) -> PlantScale:
-    """Return the magnitudes of a plant on which a search for gains is to run.
+    """Return the scale of a plant on which a search for gains is to run.
 
-    A ValueError is raised if a magnitude is 0 or infinite, since the intervals of a search are
-    proportional to ratios of magnitudes.
+    A ValueError is raised if a quantity is 0 or infinite, since the intervals of a search are
+    proportional to ratios of quantities.
     """
     scale = scale_of(plant)
     for name, value in vars(scale).items():
@@ -130,9 +135,9 @@ def nn_spans(plant: Parameters) -> Spans:
     """Return the intervals in which a search looks for the gains of the paper's network.
 
     The four gain factors of the learning rule multiply an error, and the input scale multiplies
-    temperatures. So the intervals for the paper's plant are multiplied by the ratio of the
-    temperature changes that the flow can cause on the paper's plant and on `plant`. The
-    interval for the initial weights, which have no unit, is the same for all plants.
+    temperatures. So the intervals for the paper's plant are multiplied by the temperature range
+    of the paper's plant divided by the temperature range of `plant`. The interval for the
+    initial weights, which have no unit, is the same for all plants.
     """
     factor = scale_of(PAPER).temperature_range / _finite_scale_of(plant).temperature_range
     factors = dict.fromkeys(NN_SPANS, factor) | {"weight_scale": 1.0}
@@ -142,8 +147,9 @@ def nn_spans(plant: Parameters) -> Spans:
 def dahlin_spans(plant: Parameters) -> Spans:
     """Return the intervals in which a search looks for Dahlin's two time constants, s.
 
-    The intervals for the closed-loop and the filter time constant of Dahlin's controller are
-    proportional to the time constant of `plant`, and to its time constant plus delay.
+    The interval for the closed-loop time constant of Dahlin's controller is proportional to the
+    time constant T of `plant`. The interval for the filter time constant is proportional to T
+    plus the delay of `plant`.
     """
     scale = _finite_scale_of(plant)
     time_constant = scale.time_constant * plant.sampling_interval

@@ -50,7 +50,7 @@ class LinearModel:
 
     A model has several plants at one sample k, or one plant at several samples k, or one plant
     at one sample. The coefficients of a plant that drifts hold for the step from k - 1 to k. In
-    the shapes below, the dots stand for the axis of the plants or of the samples, which is
+    the shapes of arrays, dots stand for the axis of the plants or of the samples, which is
     missing for one plant at one sample.
 
     Parameters
@@ -92,9 +92,10 @@ class LinearModel:
 
     @property
     def gain(self) -> Array:
-        """Steady-state gain, degC per t/h, shape (...); infinite for an integrating plant.
+        """Steady-state gain B(1) / A(1), degC per t/h, of each plant or at each sample.
 
-        The gain is B(1) / A(1) with the polynomials A and B of equation (28) of the paper.
+        The gain of an integrating plant is infinite. A and B are the polynomials of equation
+        (28) of the paper.
         """
         with np.errstate(divide="ignore"):
             return np.asarray(self.beta.sum(axis=-1) / (1.0 - self.alpha.sum(axis=-1)))
@@ -118,6 +119,7 @@ class LinearModel:
         The lag is d + 1 for the delay d of the plant, plus the number of leading zeros in the
         polynomial B of equation (28) of the paper. The model must have one plant.
         """
+        # The added 1 is found if all coefficients of B are 0.
         first_nonzero = np.flatnonzero([*self.parameters.b, 1.0])[0]
         return int(self.numbers.delay) + 1 + int(first_nonzero)
 
@@ -127,11 +129,11 @@ class LinearModel:
         return abs(slowest_pole([1.0, *-self.alpha]))
 
     def impulse_response(self, samples: int) -> Array:
-        """Return the impulse response of the plants, degC per t/h, shape (..., samples).
+        """Return the impulse response of each plant, degC per t/h, shape (..., samples).
 
         The first value is the effect of a flow of 1 t/h at one sample on the output d + 1
-        samples later, where d is the delay of the plant in samples. A drift of the plant is
-        left out.
+        samples later, where d is the delay of the plant in samples. Drifts of the plants are
+        left out. The dots in the shape stand for the axis of the plants.
         """
         response = np.zeros((*self.load.shape, samples))
         response[..., : self.beta.shape[-1]] = self.beta[..., :samples]
@@ -154,20 +156,21 @@ class LinearModel:
         Returns
         -------
         F : Array
-            The state transition matrix, shape (..., size, size).
+            The state transition matrix, by plant or by sample, shape (..., size, size).
         g : Array
-            The effect of the noise, elements 0 and 1, shape (size,).
+            The effect of the noise xi(k) on each element of the state, shape (size,).
         """
         c = self.parameters.c
         order = self.outputs_in_state
         size = order + len(c) - 1
         F = np.zeros((*self.load.shape, size, size)) + np.eye(size, k=-1)
-        F[..., order : order + 1, :] = 0.0  # xi(k) is new
+        xi_row = slice(order, order + 1)  # the row of xi(k); no row if C = 1
+        F[..., xi_row, :] = 0.0  # xi(k) does not depend on x(k-1)
         F[..., 0, : self.alpha.shape[-1]] = self.alpha
         F[..., 0, order:] = c[1:]
         g = np.zeros(size)
         g[0] = 1.0
-        g[order : order + 1] = 1.0  # empty if C = 1: the state then has no noise
+        g[xi_row] = 1.0
         return F, g
 
     def state_space_with_load(self, stays: Array) -> tuple[Array, Array]:
@@ -183,14 +186,14 @@ class LinearModel:
         ----------
         stays
             The mean of the piecewise constant part at sample k as a share of its value at
-            sample k - 1, shape (...).
+            sample k - 1; a number for each plant or sample.
 
         Returns
         -------
         F : Array
-            The state transition matrix, shape (..., size, size).
+            The state transition matrix, by plant or by sample, shape (..., size, size).
         E : Array
-            The effects of v(k) on the state, shape (..., size, 3).
+            The effects of v(k) on each element of the state, shape (..., size, 3).
         """
         F_noise, g = self.state_space()
         size = len(g) + 2
@@ -235,18 +238,18 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     Returns
     -------
     dict
-        `gain`, degC per t/h, and `time_constant`, `delay` and `sampling_interval`, s. The names
-        are those of the arguments of `PIController.simc` and `SmithPredictor`.
+        `gain`, degC per t/h, and `time_constant`, `delay` and `sampling_interval`, s, which
+        `PIController.simc` and `SmithPredictor` take as arguments.
 
     Raises
     ------
     ValueError
-        If the plant reaches no new steady state, or if its gain is 0.
+        If the plant reaches no new steady state, or if the gain of the plant is 0.
     """
     plant = nominal(parameters)
     interval = parameters.sampling_interval
     if plant.slowest_pole > SLOWEST_POLE:
-        raise ValueError(f"a must be of a stable plant for a step test, got {parameters.a}")
+        raise ValueError(f"a must belong to a stable plant for a step test, got {parameters.a}")
     if plant.gain == 0.0:
         raise ValueError(f"b must have a sum other than 0 for a gain, got {parameters.b}")
     settling_time = 0.0  # samples
@@ -257,14 +260,15 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     # The response begins with the last sample at which the output stands still.
     response = np.append(0.0, plant.impulse_response(samples).cumsum())
     response /= response[-1]
-    late = _time_of(LATE_LEVEL, response)
-    time_constant = 1.5 * (late - _time_of(EARLY_LEVEL, response))
-    # In samples; u(k) shows at y(k + 1) at the earliest.
-    delay = max(1, round(round(plant.numbers.delay) + late - time_constant + 1.0))
+    late_time = _time_of(LATE_LEVEL, response)  # samples
+    early_time = _time_of(EARLY_LEVEL, response)
+    time_constant = 1.5 * (late_time - early_time)
+    # A flow affects the next output at the earliest.
+    delay = round(plant.numbers.delay) + late_time - time_constant + 1.0
     return {
         "gain": float(f"{plant.gain:.4g}"),
         "time_constant": float(f"{time_constant * interval:.3g}"),
-        "delay": delay * interval,
+        "delay": max(1, round(delay)) * interval,
         "sampling_interval": interval,
     }
 
@@ -312,16 +316,16 @@ class LinearLoop:
     def of(cls, controller: LinearController, plant: LinearModel) -> "LinearLoop":
         """Return the closed loop of `controller` and `plant`, which must be a single plant."""
         controller_numerator, controller_denominator = controller.transfer()
+        # The coefficients of B begin at z^-1: a flow affects the next output at the earliest.
         numerator = np.convolve(controller_numerator, np.append(0.0, plant.beta))
         denominator = np.convolve(controller_denominator, np.append(1.0, -plant.alpha))
         return cls(numerator, denominator, round(plant.numbers.delay))
 
     def characteristic(self, delay: int) -> Array:
-        """Return the characteristic polynomial of the loop for any delay of the plant.
+        """Return the characteristic polynomial of the loop if the plant has a given delay.
 
-        The result has the coefficients of z^0, z^-1, z^-2 and so on. The poles of the loop are
-        the values of z at which the polynomial is 0. `delay` is the delay d of the plant,
-        samples.
+        The array has the coefficients of z^0, z^-1, z^-2 and so on. The poles of the loop are
+        the zeros of the characteristic polynomial in z. `delay` is in samples.
         """
         delayed_numerator = np.append(np.zeros(delay), self.numerator)
         return np.asarray(polyadd(self.denominator, delayed_numerator), np.float64)
@@ -358,12 +362,11 @@ class LinearLoop:
         return float(np.abs(sensitivity).max())
 
     def stable_delays(self) -> tuple[int, int] | None:
-        """Return the shortest and the longest delay of the plant with which the loop is stable.
+        """Return the ends of the range of delays, in samples, with which the loop is stable.
 
-        The delays d of equation (28) of the paper are counted in samples. The loop is stable
-        with all delays from the shortest to the longest, and one of these is the delay of the
-        plant. Delays above `LONGEST_DELAY` are not examined. The result is None if the loop is
-        unstable with the delay of the plant.
+        The range contains the delay d of the plant, equation (28) of the paper. Delays above
+        `LONGEST_DELAY` are not examined. The result is None if the loop is unstable with the
+        delay of the plant.
         """
         if not self.is_stable(self.delay):
             return None
@@ -384,16 +387,16 @@ def time_constant_for(
 ) -> float:
     """Return the smallest time constant of a controller with which a loop is robust enough, s.
 
-    A loop is robust enough if Ms, its maximum sensitivity, is at most `target`. The loop is
-    robust enough with all larger time constants that were tried, too.
+    A loop is robust enough if its maximum sensitivity Ms is at most `target`. The search starts
+    at the largest time constant and stops at the first that does not make the loop robust.
 
     Parameters
     ----------
     target
         The largest Ms that is allowed.
     make
-        Takes a time constant, s, and returns a controller with this time constant. A larger
-        time constant makes the loop more robust.
+        A function that takes a time constant, s, and returns a controller. A larger time
+        constant makes the loop more robust.
     plant
         The model of a single plant.
     slowest, fastest

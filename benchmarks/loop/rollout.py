@@ -99,14 +99,14 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
     seed
         Seed of the first run: the seed of run i is `seed + i`.
     """
-    numbers = parameters.lowest.select(PLANT_NUMBERS)
+    numbers: dict[str, Any] = parameters.lowest.select(PLANT_NUMBERS)
     if parameters.ranges:
         _, info = make_plants(runs, 1, **asdict(parameters)).reset(seed=seed)
         for name in parameters.ranges:
             numbers[name] = info[name]
-    return PlantNumbers(
-        **{name: np.broadcast_to(values, runs).copy() for name, values in numbers.items()}
-    )
+    for name, values in numbers.items():
+        numbers[name] = np.broadcast_to(values, runs).copy()
+    return PlantNumbers(**numbers)
 
 
 def is_random(parameters: Parameters) -> bool:
@@ -143,8 +143,8 @@ def rollout(
         Seed of the first run: the environment draws the random numbers of run i, such as its
         noise, with the seed `seed + i`.
     before
-        Function that is called with k before the controller acts at sample k, for example to
-        record or to change the weights of a network.
+        A function that is called with k before the controller acts at sample k, for example to
+        record the weights of a network.
     """
     clock = itertools.count()
 
@@ -197,7 +197,8 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     - `dead_zone_share`: share of samples with the command inside the dead zone, %;
     - `saturation_share`: share of samples with the command at or beyond a limit, %.
 
-    The two shares are NaN if the dead zone or a limit is drawn from a range.
+    `dead_zone_share` and `saturation_share` are NaN if the dead zone or a limit of the flow is
+    drawn from a range.
     """
     interval = parameters.sampling_interval / 60.0  # min
     errors = np.abs(trajectory.next_error)
@@ -219,9 +220,9 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
 
 
 def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
-    """Return the contributions of three parts of each run to the mean error, degC, by name.
+    """Return the contributions of three parts of a run to the mean error, degC, by name.
 
-    `measure` describes the names. Each array has the shape (runs,).
+    Each array has the shape (runs,). `measure` describes the three parts.
     """
     errors = np.abs(trajectory.next_error)
     k = np.arange(1, len(errors) + 1)[:, np.newaxis]
@@ -260,7 +261,7 @@ def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]
 
 
 class _StepMeasures(NamedTuple):
-    """Measures of one run that count time from the latest set-point change; see `measure`."""
+    """Measures of one run that depend on the times of set-point changes; see `measure`."""
 
     itae: float  # integral of time times |error|, degC samples^2
     overshoot: float  # largest overshoot, divided by the set-point change
@@ -268,7 +269,7 @@ class _StepMeasures(NamedTuple):
 
 
 def _measure_steps(setpoint: Array, output: Array) -> _StepMeasures:
-    """Return the measures of one run that count time from the latest set-point change.
+    """Return the measures of one run that depend on the times of set-point changes.
 
     `setpoint` and `output` have the set point and the temperature, degC, shape (samples,).
     """
@@ -298,7 +299,7 @@ def held(setpoint: Array) -> list[tuple[int, int]]:
     """Return the first sample and the end of each stretch with a constant set point.
 
     A stretch (start, stop) consists of the samples k = start to stop - 1. `setpoint` has the
-    set point of one run, degC, shape (samples,).
+    set points of one run, degC, shape (samples,).
     """
     changes = np.flatnonzero(np.diff(setpoint)) + 1
     return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
