@@ -25,7 +25,7 @@ NOTE = (
     "its criteria are met. A value without a criterion is for information only."
 )
 # Least share of runs for claims such as "the controller works" or "the weights converge".
-OFTEN = 0.9
+MOST_RUNS = 0.9
 
 
 def judge(
@@ -41,7 +41,7 @@ def judge(
         The number: an `Estimate`; or an array with a value for each run, shape (runs,), of
         which the median is estimated; or an exact number.
     unit
-        Unit of the number.
+        Unit of the number in the report; "" if the number has no unit.
     at_least, at_most
         Lower and upper bound of the number that a claim of the paper asks for. Without any
         bound, the number is for information only, and does not count in the verdict.
@@ -79,7 +79,9 @@ def judge(
     }
 
 
-def judge_share(quantity: str, happened: NDArray[np.bool_], *, often: bool = False) -> Finding:
+def judge_share(
+    quantity: str, happened: NDArray[np.bool_], *, is_criterion: bool = False
+) -> Finding:
     """Return a finding about the share of runs in which something happened, in percent.
 
     Parameters
@@ -88,11 +90,11 @@ def judge_share(quantity: str, happened: NDArray[np.bool_], *, often: bool = Fal
         What happened, in words.
     happened
         Whether it happened in each run, shape (runs,).
-    often
-        Whether the claim asks for a share of at least `OFTEN`. If not, the share is for
+    is_criterion
+        Whether the claim asks for a share of at least `MOST_RUNS`. If not, the share is for
         information only.
     """
-    at_least = 100 * OFTEN if often else -inf
+    at_least = 100 * MOST_RUNS if is_criterion else -inf
     return judge(quantity, share(happened).scaled(100), "% of runs", at_least=at_least)
 
 

@@ -44,9 +44,9 @@ class Batch:
         length
             Number of set points, and of errors, among the inputs of a network.
         in_proportion
-            Whether the learning rates are multiplied by the paper's number of nodes, or inputs,
-            divided by the number in this network. With equal learning rates, a larger network
-            learns faster, as more terms of a sum change at the same time.
+            Whether a network with n times the nodes or inputs of the paper's network has 1 / n
+            of the paper's learning rates. With equal learning rates, a larger network learns
+            faster, as more terms of a sum change at the same time.
         direction
             The sign of the plant's gain that a network assumes: -1, or 1 for the wrong sign.
         """

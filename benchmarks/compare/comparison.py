@@ -270,7 +270,7 @@ def estimate(
 
 
 def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Return the errors of each controller's runs, degC, shape (members, runs), by its name.
+    """Return an array of errors for each controller, degC, shape (members, runs), by name.
 
     `runs` has the rows of one scenario, as in `Result`.
     """

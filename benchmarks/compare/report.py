@@ -173,8 +173,10 @@ def write(
         tables = [result.responses for result in results if result.scenario == name]
         responses[name] = pd.concat(tables)
         write_numbers(folder / f"{name}.csv", responses[name])
-    scale_of = {scale.scenario.name: scale for scale in scales}
-    scale_of = {name: scale for name, scale in scale_of.items() if name in responses}
+    # The report has the scenarios with both results and least possible errors.
+    scale_of = {
+        scale.scenario.name: scale for scale in scales if scale.scenario.name in responses
+    }
     runs = runs[runs["scenario"].isin(list(scale_of))]
     if runs.empty:
         return
@@ -226,7 +228,7 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
 
 
 def sections(comparison: Comparison) -> list[Section]:
-    """Return the sections of the report, without those whose table has no row."""
+    """Return the sections of the report, but no section with an empty table."""
     reference = label(str(comparison.runs["agent"].iloc[0]))
     scenarios = [scale.scenario for scale in comparison.scales.values()]
     candidates = [

@@ -32,7 +32,7 @@ class Estimate:
     runs: int
 
     def scaled(self, factor: float) -> "Estimate":
-        """Return the estimate with value, low and high multiplied by `factor`, above 0."""
+        """Return the estimate with value and interval multiplied by `factor`, above 0."""
         return Estimate(factor * self.value, factor * self.low, factor * self.high, self.runs)
 
     def __format__(self, form: str) -> str:
