@@ -47,7 +47,8 @@ def work(options: Options) -> str:
         try:
             findings.update(options.fan_out.stream(tasks, "claims"))
         finally:
-            if missing := len(tasks) - len(findings):
+            missing = len(tasks) - len(findings)
+            if missing:
                 provenance["missing"] = f"{missing} of {len(tasks)} claims are missing"
             if findings:
                 in_order = {name: findings[name] for name in names if name in findings}

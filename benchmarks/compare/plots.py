@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.controllers.roster import label, looks
 from benchmarks.lib.pictures import DEAD_ZONE, LIMIT, SETPOINT, open_picture
-from benchmarks.lib.statistics import Estimate, written
+from benchmarks.lib.statistics import Estimate, as_text
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 
@@ -68,7 +68,7 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
             axes.plot(distance(scenario_scores), rows, **tick)
             axes.plot(distance(score.value), row, color=colour, marker=marker, ms=6.5)
             right_of_axes = (1.01, row)
-            text = written(score.value, ".3f")
+            text = as_text(score.value, ".3f")
             axes.annotate(text, right_of_axes, xycoords=("axes fraction", "data"), va="center")
         axes.set_yticks(range(len(scores)), [label(agent) for agent in scores])
         axes.set_ylim(len(scores) - 0.5, -0.5)  # The first controller has the top row.
@@ -85,7 +85,7 @@ def scores_finding(scores: Mapping[str, Estimate]) -> str:
     `scores` has the overall score of each controller by name, the highest score first.
     """
     names = [label(agent) for agent in scores]
-    values = [written(score.value, ".3f") for score in scores.values()]
+    values = [as_text(score.value, ".3f") for score in scores.values()]
     if len(scores) == 1:
         return f"{names[0]} has a score of {values[0]}"
     finding = f"{names[0]} has the highest score ({values[0]})"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 COLOURS = "#0072B2", "#D55E00"  # of lines that do not belong to a controller
 WIDTH = 7.5  # of a picture, inches: 975 pixels at 130 dots per inch
 TITLE_CHARACTERS = 90  # per line of a title: as many as fit in the width of a picture
-PALETTE = 128  # number of colours in a PNG file; fewer colours make the file smaller
+PALETTE_SIZE = 128  # number of colours in a PNG file; fewer colours make the file smaller
 # matplotlib's `rcParams` for all pictures.
 STYLE: Any = {
     "axes.grid": True,
@@ -90,7 +90,7 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()  # `Figure.savefig` would draw twice because of the layout.
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    picture.quantize(PALETTE, Image.Quantize.FASTOCTREE).save(path)
+    picture.quantize(PALETTE_SIZE, Image.Quantize.FASTOCTREE).save(path)
 
 
 def excess(ratios: ArrayLike) -> NDArray[np.float64]:
