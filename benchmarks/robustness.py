@@ -221,16 +221,8 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
 def _draw_rule(panel: Any, rows: pd.DataFrame, name: str) -> None:
     """Draw a controller's line of error ratio over valve travel in a panel.
 
-    The line has a mark for each Ms, and a large mark at the Ms `ROBUSTNESS`.
-
-    Parameters
-    ----------
-    panel
-        Axes of Matplotlib.
-    rows
-        The controller's rows of one case, in the order of Ms.
-    name
-        Name of the controller.
+    The line has a mark for each Ms, and a large mark at the Ms `ROBUSTNESS`. `panel` are axes
+    of Matplotlib, and `rows` are the rows of `run_rule` of one case, in the order of Ms.
     """
     colour, marker = ROSTER[name].look
     style: Any = {"color": colour, "marker": marker}

@@ -129,14 +129,8 @@ def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) 
     """Return the table of all findings, with the verdicts on the claims.
 
     The table has a row for each finding about a claim. A claim without findings has one row, in
-    which `runs` is missing.
-
-    Parameters
-    ----------
-    claims
-        The claims by name, each with the attributes `section` and `statement`.
-    findings
-        The findings about each claim, by the name of the claim.
+    which `runs` is missing. `claims` has the claims by name, and `findings` has the findings
+    about each claim by the name of the claim.
     """
     rows: list[dict[str, Any]] = []
     for name, findings_of_claim in findings.items():

@@ -88,8 +88,6 @@ def anticipation(
 
     Parameters
     ----------
-    scenario
-        The scenario.
     members
         The records of the controller's members, one for each trained network.
     trajectories
@@ -138,12 +136,8 @@ def movement_before_changes(
     set point, or has not reached the set point, does not count as a controller that
     anticipates.
 
-    Parameters
-    ----------
-    scenario
-        The scenario, which has a square wave.
-    trajectories
-        The signals of the runs of each member of the controller.
+    The scenario has a square wave, and `trajectories` has the signals of the runs of each
+    member of the controller.
     """
     window = int(scenario.parameters.range_of("delay")[0]) + 1
     setpoint = trajectories[0].setpoint[:, 0]
@@ -178,7 +172,7 @@ def run_surprised(
     Parameters
     ----------
     scenario
-        The scenario, which has a square wave. The surprising runs have the same plant.
+        A scenario with a square wave, which gives the plant of the surprising runs.
     members
         The records of the controller's members, one for each trained network.
     movement
@@ -186,8 +180,8 @@ def run_surprised(
     seeds
         The seeds of the runs, shape (runs,).
     are_equal
-        Whether nothing is random, so that all runs with one timetable are equal. Each member
-        then runs once with each timetable.
+        Whether nothing but the set point differs between runs. Each member then runs once with
+        each set point.
     """
     errors = []
     least_errors: list[float] = []

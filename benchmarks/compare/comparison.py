@@ -77,10 +77,6 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
 
     Parameters
     ----------
-    scenario
-        The scenario.
-    controller
-        The record of the controller.
     runs
         Number of runs of each member.
     seed
@@ -127,14 +123,8 @@ def responses_over_time(
     members. If the set points are random, the percentiles are those of the first run alone, as
     the runs have different set points.
 
-    Parameters
-    ----------
-    trajectories
-        The signals of a batch of runs for each member of the controller.
-    scenario
-        The scenario.
-    agent
-        The name of the controller in options.
+    `trajectories` has the signals of a batch of runs for each member of the controller, and
+    `agent` is the name of the controller in options.
     """
     setpoint = trajectories[0].setpoint[:, 0]
     k = np.arange(len(setpoint))
@@ -159,7 +149,6 @@ class Scale:
     Attributes
     ----------
     scenario : Scenario
-        The scenario.
     least : LeastPossible
         The least possible error of a controller that does not know future set points.
     preview : float
@@ -176,8 +165,6 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
 
     Parameters
     ----------
-    scenario
-        The scenario.
     runs
         Number of runs of a controller. The means are over the episodes of these runs, or over
         the first `EPISODES` of them if there are more, as bounds take long to compute.

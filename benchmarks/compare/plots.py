@@ -49,7 +49,7 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
     scores : mapping
         The overall score of each controller by name, the highest score first.
     estimates : pandas.DataFrame
-        A row for each scenario and controller, as `comparison.estimate` returns it.
+        The table of `comparison.estimate`.
     path : Path
         The PNG file.
     """
@@ -138,7 +138,6 @@ def plot_responses(
     errors : pandas.Series
         Mean error of each controller in the scenario, degC, by the controller's name.
     scenario : Scenario
-        The scenario in which the controllers ran.
     path : Path
         The PNG file.
     """

@@ -153,19 +153,9 @@ def write(
 ) -> None:
     """Write the CSV files, pictures and report of a comparison, and print the main tables.
 
-    Parameters
-    ----------
-    results
-        The results of each controller in each scenario.
-    scales
-        The least possible errors of the scenarios. A scenario whose least possible errors are
-        missing is in the CSV files, but not in the report.
-    controllers
-        The record of each controller by name.
-    folder
-        The folder to write to.
-    origin
-        The provenance of the results, as `provenance.origin` returns it.
+    A scenario that is not in `scales`, since its least possible errors are missing, is in the
+    CSV files, but not in the report. `controllers` has the record of each controller by name,
+    and `origin` is the provenance of the results, as `provenance.origin` returns it.
     """
     runs = pd.concat([result.runs for result in results], ignore_index=True)
     write_numbers(folder / "runs.csv", runs)
@@ -206,17 +196,10 @@ def write(
 
 
 def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:
-    """Draw the scores, and the temperature and flow over time in each scenario.
+    """Draw PNG files of the scores, and of temperature and flow over time in each scenario.
 
-    Parameters
-    ----------
-    comparison
-        The results.
-    responses
-        The tables `responses` of `comparison.Result` for all controllers, by the name of the
-        scenario.
-    folder
-        The folder of the PNG files.
+    `responses` has a table for each scenario, by its name: the tables `responses` of
+    `comparison.Result` of all controllers, one below the other.
     """
     scores = {name: comparison.scores[name] for name in comparison.ranked}
     if scores:
@@ -401,14 +384,9 @@ def difference_table(comparison: Comparison) -> pd.DataFrame:
 def table_by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
     """Return a table of texts, with a row for each controller and a column for each scenario.
 
-    Parameters
-    ----------
-    rows
-        A table with the columns `scenario` and `agent` (the controller), one row for each cell.
-    cells
-        The texts of the cells, in the order of `rows`.
-    agents
-        The names of the controllers, in the order of the rows of the result.
+    `rows` has a row for each cell, with the columns `scenario` and `agent` (the controller).
+    `cells` has the texts of the cells in the order of `rows`. The rows of the result have the
+    order of `agents`.
     """
     table = rows.assign(cell=cells).pivot(index="agent", columns="scenario", values="cell")
     table = table.loc[list(agents), rows["scenario"].unique()].fillna("").rename(index=label)
@@ -450,14 +428,8 @@ def costs_table(
 ) -> pd.DataFrame:
     """Return a table of texts on knowledge, robustness and costs, a row for each controller.
 
-    Parameters
-    ----------
-    results
-        The results of each controller in each scenario, which have the processor times.
-    controllers
-        The record of each controller by name, in the order of the rows.
-    scenario
-        The scenario for whose nominal plant the robustness of linear controllers is computed.
+    `results` has the processor times, and `controllers` the records of the controllers by name.
+    The robustness of linear controllers is that with the nominal plant of the scenario.
     """
     rows = []
     for name, controller in controllers.items():

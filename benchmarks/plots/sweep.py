@@ -132,14 +132,8 @@ def sorted_finding(plants: pd.DataFrame) -> str:
 def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     """Draw maps of the error ratio over delay and gain, one map for each controller.
 
-    Parameters
-    ----------
-    plants
-        The table of `plant_medians`. The maps have the order of the controllers in the table.
-    path
-        The PNG file.
-    nominal
-        The nominal plant, which each map marks.
+    `plants` is the table of `plant_medians`, in the order of the maps. `path` is the PNG file.
+    Each map has a mark at the nominal plant.
     """
     agents = list(plants["agent"].unique())
     columns = min(MOST_COLUMNS, len(agents))
@@ -203,14 +197,8 @@ def map_finding(plants: pd.DataFrame) -> str:
 def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) -> None:
     """Draw the map of one controller: a cell for each plant, and marks where control fails.
 
-    Parameters
-    ----------
-    axes
-        The panel of the map.
-    plants
-        The rows of `plant_medians` of one controller.
-    classes
-        The normalisation that maps an error ratio to a colour.
+    `plants` are the rows of `plant_medians` with this controller, and `classes` maps an error
+    ratio to its class of colours.
     """
     cells = plants.pivot(index="gain_factor", columns="delay", values=["ratio", "useless"])
     ratios = cells["ratio"]
