@@ -90,10 +90,10 @@ def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed:
 
 
 def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterator[Image]":
-    """Yield the frames of a film: pictures in the style in which the environment renders.
+    """Yield the frames of a film: pictures in the style of the environment's `render`.
 
-    There is a picture for every `SAMPLES_PER_FRAME` samples. In contrast to the environment's
-    pictures, all pictures span the whole run, so that the start of the run stays visible.
+    There is a picture for every `SAMPLES_PER_FRAME` samples. While the environment draws the
+    latest samples only, each frame spans the whole run, so that its start stays visible.
 
     Parameters
     ----------
@@ -124,8 +124,8 @@ def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterat
             command=float(trajectory.command[k, 0]),
             applied=float(trajectory.applied[k, 0]),
         )
-        # The set point often changes at the last sample, at which the last picture would show a
-        # large error. So each picture is one sample early.
+        # The set point often changes at the last sample of a run, where a picture would show a
+        # large error. So each picture is one sample earlier.
         if (record.k + 1) % SAMPLES_PER_FRAME == 0:
             yield Image.fromarray(frame(record))
 

@@ -112,8 +112,8 @@ def judge_times(quantity: str, samples: ArrayLike) -> Iterator[Finding]:
 def verdict(findings: Iterable[Finding]) -> str:
     """Return the verdict on a claim in words, from all findings about the claim.
 
-    Findings without a criterion do not count. An undecided finding counts as a criterion that
-    is not met.
+    Findings without a criterion do not count, and an undecided finding counts as a criterion
+    that is not met.
     """
     is_met = [finding["shown"] == "yes" for finding in findings if finding["shown"]]
     if not is_met:
@@ -167,7 +167,7 @@ def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
 def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
     """Return findings as a table of text with the columns of the report.
 
-    `rows` are rows of what `table` returns, all with a measured number.
+    `rows` are those rows of the table that `table` returns that have a measured number.
     """
     low = rows["low"].map(_three_digits)
     high = rows["high"].map(_three_digits)

@@ -166,8 +166,8 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     Parameters
     ----------
     runs
-        Number of runs of a controller. The means are over the episodes of these runs, or over
-        the first `EPISODES` of them if there are more, as bounds take long to compute.
+        Number of runs of a controller. The means are over the episodes of all runs, but at most
+        over the first `EPISODES` episodes, as bounds take long to compute.
     seed
         Seed of the first run; run i has the seed `seed + i`.
 
@@ -271,10 +271,10 @@ def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
 def misfits_of(
     controllers: Mapping[str, ControllerSpec], plants: Sequence[Parameters]
 ) -> dict[str, str]:
-    """Return a sentence for each controller that does not fit all plants, by its name.
+    """Return a sentence for each controller that does not fit all plants, by controller.
 
-    The sentence says why the controller does not fit the first such plant. `controllers` are
-    records by name, and `plants` are the plants of all scenarios.
+    The sentence says why the controller does not fit the first plant that it does not fit.
+    `controllers` are records by name, and `plants` are the plants of all scenarios.
     """
     misfits: dict[str, str] = {}
     for name, controller in controllers.items():
@@ -288,8 +288,8 @@ def ranked(estimates: pd.DataFrame, misfits: Collection[str]) -> dict[str, Estim
     """Return the overall score of each controller by name, the highest score first.
 
     The overall score is the mean score over all scenarios, members and runs, with the 95 %
-    confidence interval of `bootstrap`. `estimates` is the table of `estimate`. The controllers
-    in `misfits`, which do not fit all plants, come last.
+    confidence interval of `bootstrap`. `estimates` is the table that `estimate` returns. The
+    controllers in `misfits`, which do not fit all plants, come last.
     """
     scores = {
         str(agent): bootstrap(*tables, seed=BOOTSTRAP_SEED)

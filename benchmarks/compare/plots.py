@@ -1,7 +1,6 @@
 """Draw the pictures of a comparison of controllers.
 
-The title of a picture is a sentence on the results in the picture, such as which controller has
-the highest score. A score is 0 for an idle valve and 1 for the least possible error.
+A score is 0 for an idle valve and 1 for the least possible error.
 """
 
 from __future__ import annotations

@@ -198,8 +198,8 @@ def write(
 def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:
     """Draw PNG files of the scores, and of temperature and flow over time in each scenario.
 
-    `responses` has a table for each scenario, by its name: the tables `responses` of
-    `comparison.Result` of all controllers, one below the other.
+    `responses` has a table for each scenario, by its name, which joins the tables
+    `Result.responses` of all controllers.
     """
     scores = {name: comparison.scores[name] for name in comparison.ranked}
     if scores:
@@ -292,7 +292,7 @@ def notes(comparison: Comparison) -> list[str]:
 
 
 def notes_on_cases(comparison: Comparison, scenarios: Sequence[Scenario]) -> list[str]:
-    """Return the paragraphs above the table of cases: what it has, and who is in the pictures.
+    """Return paragraphs that explain the table of cases, and name the pictured controllers.
 
     `scenarios` are all scenarios of the report.
     """
@@ -429,7 +429,7 @@ def costs_table(
     """Return a table of texts on knowledge, robustness and costs, a row for each controller.
 
     `results` has the processor times, and `controllers` the records of the controllers by name.
-    The robustness of linear controllers is that with the nominal plant of the scenario.
+    The robustness of linear controllers is computed with the nominal plant of `scenario`.
     """
     rows = []
     for name, controller in controllers.items():

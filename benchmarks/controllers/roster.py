@@ -1,6 +1,6 @@
 """List the controllers that the commands can run, as records of the class `ControllerSpec`.
 
-The commands `compare`, `sweep`, `tune` and `watch` can run each controller in this list. The
+The commands `compare`, `sweep`, `tune` and `watch` can run each controller of the roster. The
 option `--agent NAME=MODULE:FACTORY` makes a record for a user's own controller.
 """
 
@@ -65,10 +65,10 @@ def with_bank(
 
 
 def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
-    """Return the paper's network, trained on a plant, with further learning switched off.
+    """Return the paper's networks for a batch of runs, trained on a plant and then frozen.
 
-    `parameters` are the arguments of the environment, `num_envs` is the number of runs in a
-    batch, and the initial weights of run i have the seed `seed + i`.
+    `parameters` are the arguments of the environment, `num_envs` is the number of runs, and the
+    initial weights of run i have the seed `seed + i`.
     """
     controller: Any = ROSTER["nn"].in_service(asdict(parameters), num_envs, seed)
     controller.learning = False
@@ -89,12 +89,14 @@ def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
 def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -> Agent:
     """Return a trained policy, adapted to the actuator of a plant.
 
+    The returned policy has the limits of the plant. If it compensates a dead zone, it
+    compensates the dead zone of the plant in place of the dead zone in its training, unless the
+    dead zone of the plant has a range.
+
     Parameters
     ----------
     parameters
-        The arguments of the environment. If the policy compensates a dead zone, and if the dead
-        zone of the plant is a single number, the policy compensates the plant's dead zone.
-        Otherwise, the policy is as it was in its training.
+        The arguments of the environment.
     network
         The trained policy.
     limits

@@ -1,8 +1,7 @@
 """Draw the results of a sweep, which runs controllers on many plants.
 
 Plants that differ in delay and gain are drawn as a map, and other plants as a curve of the
-sorted errors. An error ratio is a mean error divided by the least possible mean error. The
-title of a picture is a sentence on the results in it.
+sorted error ratios. An error ratio is a mean error divided by the least possible mean error.
 """
 
 from __future__ import annotations
