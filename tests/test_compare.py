@@ -160,7 +160,10 @@ class TestEstimates:
         pd.testing.assert_frame_equal(once.responses, each.responses, rtol=1e-12)
 
 
-MADE = {"started": "made today", "commit": 10 * "abcd" + "-dirty", "command": "python -m x"}
+MADE = {
+    "started": "made today", "commit": 10 * "abcd" + "-dirty", "code": 16 * "0123",
+    "command": "python -m x",
+}  # fmt: skip
 HOSTILE = "<script>alert(1)</script>|<b>|[a](javascript:x) *b* `c` \\| _d_\n\n# e &lt;"
 
 

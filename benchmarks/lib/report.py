@@ -122,11 +122,10 @@ def _source(origin: Mapping[str, Any]) -> str:
 
     `origin` is the provenance of the results, as `provenance.origin` returns it.
     """
+    version = f"code {origin['code'][:12]}"
     commit = origin["commit"]  # 40 digits, and "-dirty" if files have changed; "" without git
     if commit:
         version = f"commit {commit[:12]}{commit[40:]}"
-    else:
-        version = f"code {origin['code'][:12]}"
     command = origin["command"] or "called from Python"
     return f"{origin['started']}, {version}: {command}"
 

@@ -121,11 +121,11 @@ def sorted_finding(plants: pd.DataFrame) -> str:
     if ratios.empty:
         return "No plant has a least possible error"
     texts = [f"{ratio:.2f} for {label(str(agent))}" for agent, ratio in ratios.items()]
+    *smallest, largest = texts
     finding = "On nine plants out of ten, the error ratio is at most "
-    finding += ", ".join(texts[:-1][:2])
-    if len(texts) > 1:
-        finding += " and "
-    return finding + texts[-1]
+    if smallest:
+        finding += f"{', '.join(smallest[:2])} and "
+    return finding + largest
 
 
 def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
@@ -138,7 +138,9 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     columns = min(MOST_COLUMNS, len(agents))
     rows = math.ceil(len(agents) / columns)
     classes = BoundaryNorm(RATIO_CLASSES, ncolors=256, extend="max")
-    centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
+    # If the nominal plant has ranges, its mark is in the middle.
+    nominal_delay = np.mean(nominal.range_of("delay"))
+    nominal_gain = np.mean(nominal.range_of("gain_factor"))
     height = 1.5 + 1.9 * rows  # inches: title, legend and colour bar, and the rows
     with open_picture(path, height, map_finding(plants)) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
@@ -148,7 +150,7 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
             axes = panels[number]
             axes.set_title(label(agent))
             _draw_controller(axes, plants[plants["agent"] == agent], classes)
-            axes.plot(*centre, **NOMINAL_MARK)
+            axes.plot(nominal_delay, nominal_gain, **NOMINAL_MARK)
             if number % columns == 0:
                 axes.set_ylabel("gain factor")
             if number >= len(agents) - columns:  # no panel below this one
