@@ -18,7 +18,7 @@ from matplotlib.ticker import NullLocator
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.controllers.roster import label, looks
-from benchmarks.lib.pictures import DEAD_ZONE, LIMIT, SETPOINT, open_picture
+from benchmarks.lib.pictures import AT_LEAST, AT_MOST, DEAD_ZONE, LIMIT, SETPOINT, open_picture
 from benchmarks.lib.statistics import Estimate, as_text
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
@@ -106,13 +106,13 @@ def scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
 
     `scores` has all scores that are drawn. The axis reaches from the last of `SCORE_TICKS`
     below all scores to the first tick above them. The label of the first or last of
-    `SCORE_TICKS` begins with "≤" or "≥" if scores beyond it are drawn there.
+    `SCORE_TICKS` begins with `AT_MOST` or `AT_LEAST` if scores beyond it are drawn there.
     """
     labels = [f"{score:g}" for score in SCORE_TICKS]
     if min(scores) < LOWEST_SCORE:
-        labels[0] = f"≤ {labels[0]}"
+        labels[0] = f"{AT_MOST} {labels[0]}"
     if max(scores) > HIGHEST_SCORE:
-        labels[-1] = f"≥ {labels[-1]}"
+        labels[-1] = f"{AT_LEAST} {labels[-1]}"
     first = max(int(np.searchsorted(SCORE_TICKS, min(scores), side="right")) - 1, 0)
     last = min(int(np.searchsorted(SCORE_TICKS, max(scores))), len(SCORE_TICKS) - 1)
     ticks = distance(SCORE_TICKS[first : last + 1])

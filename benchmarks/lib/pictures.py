@@ -46,6 +46,10 @@ SETPOINT: Any = {"color": "black", "linestyle": "--", "linewidth": 0.8}
 DEAD_ZONE: Any = {"color": "0.5", "alpha": 0.2, "linewidth": 0}
 LIMIT: Any = {"color": "0.4", "linestyle": ":", "linewidth": 1.0}
 
+# The signs for "at most" and "at least" at the ticks of an axis.
+AT_MOST = "\N{LESS-THAN OR EQUAL TO}"
+AT_LEAST = "\N{GREATER-THAN OR EQUAL TO}"
+
 RATIO_LABEL = (
     "error ratio: mean error / least possible error\n(axis logarithmic in the ratio minus 1)"
 )
@@ -105,14 +109,14 @@ def scale_by_ratio(axes: Axes, ratios: ArrayLike) -> None:
     """Make the y axis of `excess(ratios)` logarithmic, with error ratios at its ticks.
 
     `ratios` are all error ratios in the panel, which set the ends of the axis. If a ratio is
-    below `RATIO_FLOOR`, the label of the lowest tick is "≤ 1.001" in place of "1.001".
+    below `RATIO_FLOOR`, the label of the lowest tick says "at most 1.001", with a sign.
     """
     from matplotlib.ticker import NullLocator
 
     heights = excess(ratios)
     labels = [f"{ratio:g}" for ratio in RATIO_TICKS]
     if np.min(ratios) < RATIO_FLOOR:
-        labels[0] = f"≤ {labels[0]}"
+        labels[0] = f"{AT_MOST} {labels[0]}"
     axes.set_yscale("log")
     axes.set_yticks(excess(RATIO_TICKS), labels)
     axes.yaxis.set_minor_locator(NullLocator())
