@@ -53,7 +53,7 @@ CAPTION = "Error ratio over valve travel of three linear controllers at several 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Run PI (SIMC), Smith and Dahlin on the paper's plant along their robustness."""
+    """Run PI (SIMC), Smith and Dahlin on the paper's plant, each at several robustnesses."""
 
     runs: Runs = 100
     """Runs of each rule in each case with noise or load."""
@@ -96,25 +96,25 @@ def lowest(scenario: Scenario) -> float:
 
 
 def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
-    """Run a controller that is tuned to an Ms, and return a row of results for each case.
+    """Run a controller that is tuned to a robustness, and return a row for each case.
 
     Parameters
     ----------
     name
         Name of the controller, one of `TUNED_BY_RULE`.
     sensitivity
-        The Ms to which the controller is tuned on the paper's plant: the largest magnitude of
-        the loop's sensitivity function.
+        The robustness to which the controller is tuned on the paper's plant: the maximum
+        sensitivity Ms, which is the largest magnitude of the loop's sensitivity function.
     runs
-        Runs of each case with noise or load; a case without has one run.
+        Number of runs in each case with noise or load. In any other case, one run is enough.
 
     Returns
     -------
     list of dict
-        A row has `agent`, the name of the controller; `Ms`; the time constant of the tuning
-        rule, s, by its name; `shortest_delay` and `longest_delay`, samples, between which the
-        loop is stable; `case`; and the means over the runs of the mean error, `mean_error`,
-        degC, and of the valve travel, `travel`, t/h.
+        Each row has the keys `agent` (the name of the controller); `Ms`; the name of the tuning
+        rule's time constant, s; `shortest_delay` and `longest_delay` (samples), between which
+        the loop is stable; `case`; `mean_error` (degC) and `travel` (the valve travel, t/h).
+        The mean error and the valve travel are means over the runs.
     """
     spec = replace(ROSTER[name], sensitivity=sensitivity)
     shortest, longest = spec.loop({}).stable_delays() or (None, None)

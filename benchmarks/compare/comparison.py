@@ -72,8 +72,7 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     """Run all members of a controller in a scenario, and return the results.
 
     If neither the scenario nor the controller uses random numbers, all runs of a member are
-    equal. In this case, each member runs once, and the results have a copy of this run for each
-    seed.
+    equal, so that the member runs once, and the results have a copy of this run for each seed.
 
     Parameters
     ----------
