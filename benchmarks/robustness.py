@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 # Controllers with a tuning rule that has a single parameter, a time constant.
-RULES = [name for name, spec in ROSTER.items() if spec.tuned_by]
+TUNED_BY_RULE = [name for name, spec in ROSTER.items() if spec.tuned_by]
 CASES = "square", "square-noise", "constant", "load"  # names of scenarios
 # The panels of the picture: a case, and the title of its panel.
 PANELS = {
@@ -32,7 +32,7 @@ PANELS = {
 # Values of Ms, the largest magnitude of the loop's sensitivity function: the lower, the more
 # robust is the loop. `ROBUSTNESS` is the Ms at which controllers are compared.
 SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3
-TICKS = 200, 500, 1000, 2000, 5000  # ticks of the axis of valve travel in noise, t/h
+TRAVEL_TICKS = 200, 500, 1000, 2000, 5000  # ticks of the axis of valve travel in noise, t/h
 TEXT = (
     "The maximum sensitivity Ms is the largest magnitude of the sensitivity function of a "
     "control loop: the lower Ms is, the more robust is the loop. Each of the three controllers "
@@ -54,7 +54,7 @@ CAPTION = "Error ratio over valve travel of three linear controllers at several 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Run PI (SIMC), Smith and Dahlin on the paper's plant along their robustness."""
+    """Run PI (SIMC), Smith and Dahlin on the paper's plant, each at several robustnesses."""
 
     runs: Runs = 100
     """Runs of each rule in each case with noise or load."""
@@ -63,7 +63,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run all controllers, write report, picture and data, and return the closing message."""
+    """Run all controllers, write the results, and return a sentence on where they are."""
     import pandas as pd
 
     from benchmarks.lib.report import Section, write_report
@@ -72,7 +72,7 @@ def work(options: Options) -> str:
     bounds: dict[str, Any] = {name: partial(lowest, SCENARIOS[name]) for name in CASES}
     loops: dict[str, Any] = {
         f"{name}, Ms {ms:g}": partial(run_rule, name, ms, options.runs)
-        for name in RULES
+        for name in TUNED_BY_RULE
         for ms in SENSITIVITIES
     }
     results = dict(options.fan_out.stream({**bounds, **loops}, "robustness"))
@@ -97,25 +97,25 @@ def lowest(scenario: Scenario) -> float:
 
 
 def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
-    """Run a controller that is tuned to an Ms, and return a row of results for each case.
+    """Run a controller that is tuned to a robustness, and return a row for each case.
 
     Parameters
     ----------
     name
-        Name of the controller, one of `RULES`.
+        Name of the controller, one of `TUNED_BY_RULE`.
     sensitivity
-        The Ms to which the controller is tuned on the paper's plant: the largest magnitude of
-        the loop's sensitivity function.
+        The robustness to which the controller is tuned on the paper's plant: the maximum
+        sensitivity Ms, which is the largest magnitude of the loop's sensitivity function.
     runs
-        Runs of each case with noise or load; a case without has one run.
+        Number of runs in each case with noise or load. In any other case, one run is enough.
 
     Returns
     -------
     list of dict
-        A row has `agent`, the name of the controller; `Ms`; the time constant of the tuning
-        rule, s, by its name; `shortest_delay` and `longest_delay`, samples, between which the
-        loop is stable; `case`; and the means over the runs of the mean error, `mean_error`,
-        degC, and of the valve travel, `travel`, t/h.
+        Each row has the keys `agent` (the name of the controller); `Ms`; the name of the tuning
+        rule's time constant, s; `shortest_delay` and `longest_delay` (samples), between which
+        the loop is stable; `case`; `mean_error` (degC) and `travel` (the valve travel, t/h).
+        The mean error and the valve travel are means over the runs.
     """
     spec = replace(ROSTER[name], sensitivity=sensitivity)
     shortest, longest = spec.loop({}).stable_delays() or (None, None)
@@ -141,16 +141,16 @@ def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
 
 
 def overview(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the report's table as text, with a row for each controller of `RULES`.
+    """Return the table of the report, a table of texts with a row for each controller.
 
-    `rows` are the rows of `run_rule` at a single Ms, with an additional column `ratio`, the
-    mean error divided by the least possible error. The report's table has a column of ratios
-    for each case.
+    `rows` are the rows of `run_rule` for all controllers at a single Ms, with an additional
+    column `ratio`, the mean error divided by the least possible error. The table of the report
+    has a column of error ratios for each case.
     """
     import pandas as pd
 
     lines = []
-    for name in RULES:
+    for name in TUNED_BY_RULE:
         by_case = rows[rows["agent"] == name].set_index("case")
         noisy: Any = by_case.loc["square-noise"]
         argument = ROSTER[name].tuned_by
@@ -201,14 +201,14 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
         for panel, (case, title) in zip(panels, PANELS.items(), strict=True):
             panel.set_title(title)
             rows_of_case = rows[rows["case"] == case]
-            for name in RULES:
+            for name in TUNED_BY_RULE:
                 _draw_rule(panel, rows_of_case[rows_of_case["agent"] == name], name)
             panel.set_xlabel("valve travel in a run (t/h)")
             panel.set_ylabel("mean error / least possible error")
             panel.yaxis.set_major_locator(MaxNLocator(5))
         noisy = panels[0]
         noisy.set_xscale("log")
-        noisy.set_xticks(TICKS, [f"{tick:,}" for tick in TICKS])
+        noisy.set_xticks(TRAVEL_TICKS, [f"{tick:,}" for tick in TRAVEL_TICKS])
         noisy.xaxis.set_minor_locator(NullLocator())
         handles, names = noisy.get_legend_handles_labels()
         large: Any = {"marker": "o", "markersize": 9, "markeredgecolor": "k", "linestyle": ""}
@@ -222,16 +222,8 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
 def _draw_rule(panel: Any, rows: pd.DataFrame, name: str) -> None:
     """Draw a controller's line of error ratio over valve travel in a panel.
 
-    The line has a mark for each Ms, and a large mark at the Ms `ROBUSTNESS`.
-
-    Parameters
-    ----------
-    panel
-        Axes of Matplotlib.
-    rows
-        The controller's rows of one case, in the order of Ms.
-    name
-        Name of the controller.
+    The line has a mark for each Ms, and a large mark at the Ms `ROBUSTNESS`. `panel` are axes
+    of Matplotlib, and `rows` are the rows of `run_rule` of one case, in the order of Ms.
     """
     colour, marker = ROSTER[name].look
     style: Any = {"color": colour, "marker": marker}

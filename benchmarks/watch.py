@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 SAMPLES_PER_FRAME = 20  # samples of the run between two frames of the film
-DURATION = 100  # ms for which a frame is shown
-LAST_DURATION = 2000  # ms for which the last frame is shown, before the film repeats
+FRAME_DURATION = 100  # ms for which a frame is shown
+LAST_FRAME_DURATION = 2000  # ms for which the last frame is shown, before the film repeats
 COLOURS = 64  # number of colours in the film; few colours make the file small
 
 
@@ -42,14 +42,15 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run a controller on a case, write a film of the run, and return the closing lines.
+    """Run a controller on a case, write a film of the run, and return two lines of text.
 
-    A `UsageError` is raised if an option is invalid.
+    The first line has the mean error of the run, and the second line names the file. A
+    `UsageError` is raised if an option is invalid.
     """
     cases = options.plant.cases(SCENARIOS)
-    wanted = options.scenario or next(iter(cases))
-    known("--scenario", [wanted], cases)
-    case = cases[wanted]
+    case_name = options.scenario or next(iter(cases))
+    known("--scenario", [case_name], cases)
+    case = cases[case_name]
     if "=" in options.agent:
         (controller,) = chosen([], [options.agent]).values()
     else:
@@ -70,37 +71,29 @@ def work(options: Options) -> str:
 
 
 def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed: int) -> None:
-    """Write a film of a run as a GIF file.
+    """Write a film of a run to the GIF file `path`; the other arguments are those of `frames`.
 
-    Parameters
-    ----------
-    path
-        The GIF file.
-    trajectory
-        The signals of the run.
-    parameters
-        The arguments of the environment.
-    seed
-        The seed of the run.
+    The film replaces an older film only when it is complete.
     """
     from PIL.Image import Dither, Quantize
 
     pictures = list(frames(trajectory, parameters, seed))
+    # All pictures have the colours of the last picture, which shows the whole run.
     palette = pictures[-1].quantize(COLOURS, Quantize.MAXCOVERAGE, kmeans=3)
     first, *rest = [
         picture.quantize(palette=palette, dither=Dither.NONE) for picture in pictures
     ]
-    durations = [DURATION] * len(rest) + [LAST_DURATION]
+    durations = [FRAME_DURATION] * len(rest) + [LAST_FRAME_DURATION]
     unfinished = path.with_name(f".{path.name}.unfinished")
     first.save(unfinished, "GIF", save_all=True, append_images=rest, duration=durations, loop=0)
     unfinished.replace(path)
 
 
 def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterator[Image]":
-    """Yield the frames of a film: pictures in the style in which the environment renders.
+    """Yield the frames of a film: pictures in the style of the environment's `render`.
 
-    There is a picture for every `SAMPLES_PER_FRAME` samples. In contrast to the environment's
-    pictures, all pictures span the whole run, so that the start of the run stays visible.
+    There is a picture for every `SAMPLES_PER_FRAME` samples. While the environment draws the
+    latest samples only, each frame spans the whole run, so that its start stays visible.
 
     Parameters
     ----------
@@ -131,8 +124,8 @@ def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterat
             command=float(trajectory.command[k, 0]),
             applied=float(trajectory.applied[k, 0]),
         )
-        # The set point often changes at the last sample, at which the last picture would show a
-        # large error. So each picture is one sample early.
+        # The set point often changes at the last sample of a run, where a picture would show a
+        # large error. So each picture is one sample earlier.
         if (record.k + 1) % SAMPLES_PER_FRAME == 0:
             yield Image.fromarray(frame(record))
 

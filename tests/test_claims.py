@@ -111,7 +111,7 @@ class TestCommand:
             def run(self, agent, samples, before=None, **arguments):
                 return super().run(agent, min(samples, 60), before, **arguments)
 
-        monkeypatch.setattr(examinations, "LEARNING", 30)
+        monkeypatch.setattr(examinations, "LEARNING_LENGTH", 30)
         rows = [
             {"claim": name, **{column: row[column] for column in ("value", "low", "high")}}
             for name in CLAIMS

@@ -160,7 +160,10 @@ class TestEstimates:
         pd.testing.assert_frame_equal(once.responses, each.responses, rtol=1e-12)
 
 
-MADE = {"started": "made today", "commit": 10 * "abcd" + "-dirty", "command": "python -m x"}
+MADE = {
+    "started": "made today", "commit": 10 * "abcd" + "-dirty", "code": 16 * "0123",
+    "command": "python -m x",
+}  # fmt: skip
 HOSTILE = "<script>alert(1)</script>|<b>|[a](javascript:x) *b* `c` \\| _d_\n\n# e &lt;"
 
 
@@ -285,7 +288,7 @@ class TestCompare:
         assert len(pd.read_csv(out / "constant.csv")) == 2 * 600 + 600
         for name in ("constant", "constant-noise", "scores"):
             picture = matplotlib.image.imread(out / f"{name}.png")
-            assert len(np.unique(picture[::4, ::4] @ [1.0, 2.0, 4.0, 0.0])) > 20  # colours
+            assert len(np.unique(picture[::4, ::4] @ [1.0, 2.0, 4.0, 0.0])) > 10  # colours
 
     @pytest.mark.usefixtures("undrawn")
     def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):
@@ -439,4 +442,4 @@ class TestCompare:
         table = report.costs_table([], specs, SCENARIOS["square"])
         assert table["Ms"].tolist() == ["unstable", "1.60", "1.60", "1.60", ""]
         delays = table["stable with delays of (samples)"].tolist()
-        assert delays == ["none around the plant's", "0 to 56", "0 to 52", "0 to 54", ""]
+        assert delays == ["none", "0 to 56", "0 to 52", "0 to 54", ""]

@@ -44,6 +44,10 @@ class TestFindings:
             "Smith is within 5 % of the least possible error on 75 % of the plants, "
             "PI (1992) on 33 %"
         )
+        third = pd.DataFrame({"agent": "nn", "ratio": [1.0, 2.0, 2.0, 2.0]})
+        assert sweep.map_finding(pd.concat([plants, third])).endswith(
+            "PI (1992) on 33 %, and every other controller on at most 25 %"
+        )
         assert sweep.sorted_finding(plants) == (
             "On nine plants out of ten, the error ratio is at most 1.16 for Smith and 2.80 for "
             "PI (1992)"

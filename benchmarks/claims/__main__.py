@@ -29,10 +29,10 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Examine the claims, write the report and return the closing message for users.
+    """Examine the claims, write the report, and return a sentence that says where it is.
 
-    If the examination of a claim fails, the error is raised after the report of the other
-    claims was written.
+    If the examination of a claim fails, the report on all other claims is written before the
+    error is raised.
     """
     from benchmarks.claims.claims import CLAIMS, examined
     from benchmarks.claims.findings import sections, table
@@ -48,7 +48,8 @@ def work(options: Options) -> str:
         try:
             findings.update(options.fan_out.stream(tasks, "claims"))
         finally:
-            if missing := len(tasks) - len(findings):
+            missing = len(tasks) - len(findings)
+            if missing:
                 provenance["missing"] = f"{missing} of {len(tasks)} claims are missing"
             if findings:
                 in_order = {name: findings[name] for name in names if name in findings}

@@ -162,4 +162,6 @@ def examined(name: str, batch: Batch) -> list[Finding]:
     `name` is a key of `CLAIMS`, and `batch` gives the number of runs and their seeds.
     """
     examine = CLAIMS[name].examine
-    return [] if examine is None else list(examine(batch))
+    if examine is None:
+        return []
+    return list(examine(batch))

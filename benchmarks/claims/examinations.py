@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from agents import DirectNNController, PIController
-from benchmarks.claims.findings import OFTEN, Finding, judge, judge_share, judge_times
+from benchmarks.claims.findings import MOST_RUNS, Finding, judge, judge_share, judge_times
 from benchmarks.claims.runs import PAPER_LENGTH, Batch, WeightLog, converged_at
 from benchmarks.loop import linear
 from benchmarks.loop.rollout import mean_error, settled
@@ -24,19 +24,19 @@ from mptc_gym import PRESETS, Parameters
 
 # Numbers that give words of the claims a meaning. They were chosen before any run, and are the
 # same for all claims.
-NOTABLE = 0.05  # a relative change of an error below this share is not "notable"
-MUCH = 0.2  # "much better", "seriously worse": the error differs by at least this share
-SOON = 150  # samples; the paper says that the weights converge within 150 sampling intervals
+NOTABLE_CHANGE = 0.05  # a relative change of an error below this share is not "notable"
+LARGE_CHANGE = 0.2  # "much better", "seriously worse": the error differs by at least this share
+PAPER_CONVERGENCE = 150  # samples within which, according to the paper, the weights converge
 
-LEVEL = 5.0  # degC, the constant set point, and the amplitude of the square wave
-SAMPLES = 1200  # length of a run, unless the case has another length
-LEARNING = 600  # samples after which a network counts as trained
-NOISY = PRESETS["noisy"]
-NOISY_SQUARE = "square wave, R = 0.5 °C²"
+SETPOINT_LEVEL = 5.0  # degC, the constant set point, and the amplitude of the square wave
+RUN_LENGTH = 1200  # samples, unless the case has another length
+LEARNING_LENGTH = 600  # samples after which a network counts as trained
+WITH_NOISE = PRESETS["noisy"]
+NOISY_SQUARE_TITLE = "square wave, R = 0.5 °C²"
 # The cases of the set point. The constant set point comes first: without later changes, its
 # error comes from initial learning alone.
 SETPOINTS = PAPER_SETPOINTS[::-1]
-CONSTANT, SQUARE = (setpoint.arguments for setpoint in SETPOINTS)
+CONSTANT_SETPOINT, SQUARE_WAVE = (setpoint.arguments for setpoint in SETPOINTS)
 # Words for the learning rates ("gains") of a network with more nodes or inputs than the paper's
 # network, by the argument `in_proportion` of `Batch.networks`.
 WORDS_FOR_RATES = {False: "the same gains", True: "gains in proportion"}
@@ -59,7 +59,9 @@ def convergence(batch: Batch) -> Findings:
         times = converged_at(np.array(log.weights))  # samples; infinite if not converged
         title = setpoint.title
         yield judge_share(
-            f"weights converged within {SOON} samples, {title}", times <= SOON, often=True
+            f"weights converged within {PAPER_CONVERGENCE} samples, {title}",
+            times <= PAPER_CONVERGENCE,
+            is_criterion=True,
         )
         yield from judge_times(f"time until the weights have converged, {title}", times)
         yield judge_share(f"weights not converged when the run ends, {title}", np.isinf(times))
@@ -72,12 +74,14 @@ def dead_zone(batch: Batch) -> Findings:
         narrow = batch.run_nn(setpoint.samples, **setpoint.arguments)
         wide = batch.run_nn(setpoint.samples, **setpoint.arguments, dead_zone=7.0)
         yield judge_share(
-            f"settled when the run ends, dead zone 7 t/h, {title}", settled(wide), often=True
+            f"settled when the run ends, dead zone 7 t/h, {title}",
+            settled(wide),
+            is_criterion=True,
         )
         yield judge(
             f"mean error at dead zone 7 t/h, as a multiple of the error at 5, {title}",
             mean_error(wide) / mean_error(narrow),
-            at_least=1 + MUCH,
+            at_least=1 + LARGE_CHANGE,
         )
         yield judge(f"mean error, dead zone 5 t/h, {title}", mean_error(narrow), "°C")
         yield judge(f"mean error, dead zone 7 t/h, {title}", mean_error(wide), "°C")
@@ -88,27 +92,27 @@ def noise(batch: Batch) -> Findings:
 
     At a constant set point, only the last 600 of 1,200 samples count, when learning is over.
     """
-    idle_runs = batch.run_pi({"kp": 0.0, "ki": 0.0}, SAMPLES, setpoint=0.0, **NOISY)
+    idle_runs = batch.run_pi({"kp": 0.0, "ki": 0.0}, RUN_LENGTH, setpoint=0.0, **WITH_NOISE)
     idle_deviation = idle_runs[-600:].output.std(axis=0)
-    runs = batch.run_nn(SAMPLES, **CONSTANT, **NOISY)[-600:]
+    runs = batch.run_nn(RUN_LENGTH, **CONSTANT_SETPOINT, **WITH_NOISE)[-600:]
     errors = runs.setpoint - runs.output
     yield judge(
         "absolute value of the average error over the last 600 of 1,200 samples, constant set "
         "point",
         np.abs(errors.mean(axis=0)),
         "°C",
-        at_most=0.05 * LEVEL,
+        at_most=0.05 * SETPOINT_LEVEL,
     )
     yield judge(
         "standard deviation of y over the last 600 of 1,200 samples, as a multiple of the "
         "deviation without control",
         errors.std(axis=0) / idle_deviation,
-        at_most=1 + MUCH,
+        at_most=1 + LARGE_CHANGE,
     )
-    square_errors = mean_error(batch.run_nn(SAMPLES, **SQUARE, **NOISY))
-    is_better = square_errors < LEVEL  # the mean error without control
+    square_errors = mean_error(batch.run_nn(RUN_LENGTH, **SQUARE_WAVE, **WITH_NOISE))
+    is_better = square_errors < SETPOINT_LEVEL  # the mean error without control
     yield judge_share(
-        "mean error below the error without control, square wave", is_better, often=True
+        "mean error below the error without control, square wave", is_better, is_criterion=True
     )
     yield judge("mean error, square wave", square_errors, "°C")
     yield judge("standard deviation of y without control", idle_deviation, "°C")
@@ -121,18 +125,22 @@ def pi_gains(batch: Batch) -> Findings:
     and that a higher Kp makes the loop unstable.
     """
     kp = PAPER_PI["kp"]
-    runs = batch.run_pi(PAPER_PI, SAMPLES, **CONSTANT)
+    runs = batch.run_pi(PAPER_PI, RUN_LENGTH, **CONSTANT_SETPOINT)
     yield judge(
         f"peak to peak of y over the last 300 of 1,200 samples, Kp = {kp:g}, constant set "
         "point",
         np.ptp(runs.output[-300:]),
         "°C",
-        at_least=2 * 0.05 * LEVEL,
+        at_least=2 * 0.05 * SETPOINT_LEVEL,
     )
-    cases = {"constant set point": CONSTANT, "square wave": SQUARE, NOISY_SQUARE: NOISY}
+    cases = {
+        "constant set point": CONSTANT_SETPOINT,
+        "square wave": SQUARE_WAVE,
+        NOISY_SQUARE_TITLE: WITH_NOISE,
+    }
     for title, arguments in cases.items():
         yield best_lower_gain(batch, title, arguments)
-    runs = batch.run_pi(DOUBLED_PI, SAMPLES, **CONSTANT)
+    runs = batch.run_pi(DOUBLED_PI, RUN_LENGTH, **CONSTANT_SETPOINT)
     limited_share = 100 * np.mean(np.abs(runs.applied[-300:]) == Parameters().u_max)
     yield judge(
         f"samples of the last 300 with the flow at a limit, Kp = {2 * kp:g}",
@@ -154,9 +162,10 @@ def pi_gains(batch: Batch) -> Findings:
 def best_lower_gain(batch: Batch, title: str, arguments: Arguments) -> Finding:
     """Compare the paper's PI controller with the best of those with a lower gain Kp.
 
-    `title` is the name of the case, and `arguments` are its arguments of the environment.
+    `title` is the name of a case, and `arguments` are the arguments of the environment in this
+    case.
     """
-    errors = [mean_error(batch.run_pi(gains, SAMPLES, **arguments)) for gains in LOWER_PI]
+    errors = [mean_error(batch.run_pi(gains, RUN_LENGTH, **arguments)) for gains in LOWER_PI]
     paper_errors = errors[-1]  # LOWER_PI ends with the paper's gains.
     medians = [float(np.median(error)) for error in errors[:-1]]
     best = int(np.argmin(medians))
@@ -164,15 +173,15 @@ def best_lower_gain(batch: Batch, title: str, arguments: Arguments) -> Finding:
         f"mean error with the best lower Kp ({LOWER_PI[best]['kp']:.1f}) as a multiple of "
         f"the error with {PAPER_PI['kp']:g}, {title}",
         (errors[best] / paper_errors).squeeze(),  # one exact number without noise
-        at_least=1 - NOTABLE,
+        at_least=1 - NOTABLE_CHANGE,
     )
 
 
 def largest_pole(gains: PIGains) -> float:
     """Return the largest magnitude of a pole of the paper's plant with a PI controller.
 
-    The closed loop is taken without the actuator's dead zone and limits. The loop is stable if
-    the magnitude is below 1.
+    The control loop is taken without the actuator's dead zone and limits. It is stable if the
+    largest magnitude is below 1.
     """
     plant = linear.nominal(Parameters())
     return linear.LinearLoop.of(PIController(gains["kp"], gains["ki"]), plant).largest_pole()
@@ -180,7 +189,7 @@ def largest_pole(gains: PIGains) -> float:
 
 def against_pi(batch: Batch, gains: PIGains) -> Findings:
     """Compare the paper's network with a PI controller of these gains, in the same noise."""
-    for noise_title, noise_arguments in (("", {}), (", R = 0.5 °C²", NOISY)):
+    for noise_title, noise_arguments in (("", {}), (", R = 0.5 °C²", WITH_NOISE)):
         for setpoint in SETPOINTS:
             arguments = {**setpoint.arguments, **noise_arguments}
             nn_errors = mean_error(batch.run_nn(setpoint.samples, **arguments))
@@ -189,11 +198,11 @@ def against_pi(batch: Batch, gains: PIGains) -> Findings:
             yield judge(
                 f"mean error of the NN as a multiple of the PI's, {case}",
                 nn_errors / pi_errors,
-                at_most=1 - MUCH,
+                at_most=1 - LARGE_CHANGE,
             )
             yield judge_share(f"the NN is better, {case}", nn_errors < pi_errors)
-    nn_errors = mean_error(batch.run_nn(SAMPLES, dead_zone=7.0))
-    pi_errors = mean_error(batch.run_pi(gains, SAMPLES, dead_zone=7.0))
+    nn_errors = mean_error(batch.run_nn(RUN_LENGTH, dead_zone=7.0))
+    pi_errors = mean_error(batch.run_pi(gains, RUN_LENGTH, dead_zone=7.0))
     yield judge(
         "mean error of the NN as a multiple of the PI's, square wave, dead zone 7 t/h",
         nn_errors / pi_errors,
@@ -201,26 +210,26 @@ def against_pi(batch: Batch, gains: PIGains) -> Findings:
 
 
 def wrong_direction(batch: Batch) -> Findings:
-    """Measure when networks that assume the wrong sign of the plant's gain diverge.
+    """Measure when runs diverge if the networks assume the wrong sign of the plant's gain.
 
-    A run counts as diverged when the temperature exceeds 90 % of the largest deviation that the
-    limited flow can cause.
+    A run has diverged when the temperature exceeds 90 % of the largest deviation that the flow,
+    which is limited, can cause.
     """
-    runs = batch.run(batch.networks(direction=1), 600, **CONSTANT)
+    runs = batch.run(batch.networks(direction=1), 600, **CONSTANT_SETPOINT)
     plant = Parameters()
     largest_deviation = abs(linear.nominal(plant).gain) * plant.u_max  # degC
     is_beyond = np.abs(runs.output) > 0.9 * largest_deviation
     times = np.where(is_beyond.any(axis=0), np.argmax(is_beyond, axis=0), np.inf)
     yield judge_share(
         "temperature exceeds 90 % of the largest deviation that the flow can cause, in either "
-        f"direction, within {SOON} samples",
-        times <= SOON,
-        often=True,
+        f"direction, within {PAPER_CONVERGENCE} samples",
+        times <= PAPER_CONVERGENCE,
+        is_criterion=True,
     )
     yield judge_share(
         "temperature exceeds this share when the run ends, after 600 samples",
         is_beyond[-1],
-        often=True,
+        is_criterion=True,
     )
     yield judge_share("temperature is on the wrong side when the run ends", runs.output[-1] < 0)
     yield from judge_times("time until the temperature exceeds this share", times)
@@ -229,10 +238,11 @@ def wrong_direction(batch: Batch) -> Findings:
 def other_shapes(batch: Batch, shapes: Mapping[str, dict[str, int]]) -> Findings:
     """Compare networks with more nodes or inputs with the paper's network.
 
-    `shapes` has the arguments `nodes` or `length` of `Batch.networks` by the title of a shape.
-    Each shape is examined with the paper's learning rates, and with rates scaled in proportion.
+    `shapes` has the arguments `nodes` or `length` of `Batch.networks` for each kind of network,
+    by its title in the report. Each kind of network runs with the paper's learning rates, and
+    with learning rates that are scaled in proportion.
     """
-    noisy_square = Scenario("noisy-square", NOISY_SQUARE, SAMPLES, NOISY)
+    noisy_square = Scenario("noisy-square", NOISY_SQUARE_TITLE, RUN_LENGTH, WITH_NOISE)
     for case in (*SETPOINTS, noisy_square):
         paper_errors = mean_error(batch.run_nn(case.samples, **case.arguments))
         for (title, shape), in_proportion in itertools.product(shapes.items(), (False, True)):
@@ -245,22 +255,22 @@ def other_shapes(batch: Batch, shapes: Mapping[str, dict[str, int]]) -> Findings
                 f"mean error with {title}, {rates}, as a multiple of the error of the paper's "
                 f"network, {case.title}",
                 mean_error(runs) / paper_errors,
-                at_least=1 - NOTABLE,
+                at_least=1 - NOTABLE_CHANGE,
             )
 
 
 def reliability(batch: Batch) -> Findings:
     """Compare networks of 3, 6 and 12 hidden nodes, before and after the failure of a node.
 
-    After `LEARNING` samples, the output of one hidden node stays at 0 or at 1 for ever.
+    After `LEARNING_LENGTH` samples, the output of one hidden node stays at 0 or at 1 for ever.
     """
     for in_proportion, stuck_at in itertools.product((False, True), (0, 1)):
         errors = {}  # after the failure, by the number of nodes
         for nodes in (3, 6, 12):
             networks = batch.networks(nodes=nodes, in_proportion=in_proportion)
             damage = partial(damage_networks, networks, stuck_at)
-            runs = batch.run(networks, 2 * LEARNING, damage, **CONSTANT)
-            runs_before, runs_after = runs[:LEARNING], runs[LEARNING:]
+            runs = batch.run(networks, 2 * LEARNING_LENGTH, damage, **CONSTANT_SETPOINT)
+            runs_before, runs_after = runs[:LEARNING_LENGTH], runs[LEARNING_LENGTH:]
             errors[nodes] = mean_error(runs_after)
             case = f"{nodes} nodes, one stuck at {stuck_at}, {WORDS_FOR_RATES[in_proportion]}"
             if stuck_at == 0:  # Before the failure, the runs are the same for 0 and 1.
@@ -275,17 +285,17 @@ def reliability(batch: Batch) -> Findings:
                 yield judge(
                     f"this mean error as a multiple of the error with 3 nodes, {case}",
                     errors[nodes] / errors[3],
-                    at_most=1 - NOTABLE,
+                    at_most=1 - NOTABLE_CHANGE,
                 )
 
 
 def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None:
-    """Damage the first hidden node of each network at the sample k = `LEARNING`.
+    """Damage the first hidden node of each network at the sample k = `LEARNING_LENGTH`.
 
     A rollout calls this function before each sample. The output of the damaged node stays at
     `stuck_at`, 0 or 1, and the other nodes go on learning.
     """
-    if k != LEARNING:
+    if k != LEARNING_LENGTH:
         return
     weights = networks.weights
     weights.W[..., 0, :] = 0.0
@@ -301,7 +311,7 @@ def keep_learning(batch: Batch) -> Findings:
     and the weights either continue to learn or stay as they are.
     """
     networks = batch.networks()
-    batch.run(networks, SAMPLES, **SQUARE)
+    batch.run(networks, RUN_LENGTH, **SQUARE_WAVE)
     learnt_weights = networks.weights
     changes: dict[str, Arguments] = {
         "gain times 0.75": {"gain_factor": 0.75},
@@ -314,17 +324,19 @@ def keep_learning(batch: Batch) -> Findings:
     for title, plant in changes.items():
         networks.weights = learnt_weights
         networks.learning = True
-        learning_errors = mean_error(batch.run(networks, SAMPLES, **SQUARE, **plant))
+        learning_errors = mean_error(batch.run(networks, RUN_LENGTH, **SQUARE_WAVE, **plant))
         networks.weights = learnt_weights
         networks.learning = False
-        frozen_errors = mean_error(batch.run(networks, SAMPLES, **SQUARE, **plant))
+        frozen_errors = mean_error(batch.run(networks, RUN_LENGTH, **SQUARE_WAVE, **plant))
         yield judge(
             f"mean error of learning weights divided by that of frozen weights, {title}",
             learning_errors / frozen_errors,
-            at_most=1 - NOTABLE if plant else math.inf,  # "no change" is information only
+            at_most=1 - NOTABLE_CHANGE
+            if plant
+            else math.inf,  # "no change" is information only
         )
         yield judge(f"mean error of frozen weights, {title}", frozen_errors, "°C")
-        is_useless = frozen_errors >= LEVEL  # the mean error without control
+        is_useless = frozen_errors >= SETPOINT_LEVEL  # the mean error without control
         yield judge_share(f"frozen weights do no better than no control, {title}", is_useless)
 
 
@@ -353,8 +365,8 @@ def direction_only(batch: Batch) -> Findings:
     for setpoint, plants in series.items():
         yield judge_worst(plants, f"all {len(plants)} combinations, {setpoint}")
         yield judge(
-            f"combinations in which at least {OFTEN:.0%} of runs settle, {setpoint}",
-            100 * (plants["share"] >= OFTEN).mean(),
+            f"combinations in which at least {MOST_RUNS:.0%} of runs settle, {setpoint}",
+            100 * (plants["share"] >= MOST_RUNS).mean(),
             "%",
         )
 
@@ -385,8 +397,8 @@ def plants_that_settle(
     rows = []
     for constant, gain, delay in itertools.product((0.5, 1.0, 2.0), gains, (9, 18, 27, 36)):
         plant = {"gain_factor": gain, "time_constant_factor": constant, "delay": delay}
-        setpoint = LEVEL * gain if is_scaled else LEVEL
-        settles = settled(batch.run_nn(SAMPLES, setpoint=setpoint, **plant))
+        setpoint = SETPOINT_LEVEL * gain if is_scaled else SETPOINT_LEVEL
+        settles = settled(batch.run_nn(RUN_LENGTH, setpoint=setpoint, **plant))
         row = {"constant": constant, "gain": gain, "delay": delay}
         rows.append({**row, "runs": settles, "share": settles.mean()})
     return pd.DataFrame(rows)
@@ -395,12 +407,12 @@ def plants_that_settle(
 def judge_worst(plants: pd.DataFrame, text: str) -> Finding:
     """Return a finding about the plant on which the smallest share of runs settles.
 
-    `plants` are rows of what `plants_that_settle` returns, and `text` describes these plants in
-    words.
+    `plants` are rows of the table of `plants_that_settle`, and `text` describes these plants in
+    the report.
     """
     worst = plants.iloc[plants["share"].argmin()]
     quantity = (
         f"settled within 1,200 samples, the worst of {text} (delay {worst['delay']}, gain "
         f"{worst['gain']:g}, time constant {worst['constant']:g})"
     )
-    return judge_share(quantity, worst["runs"], often=True)
+    return judge_share(quantity, worst["runs"], is_criterion=True)

@@ -25,7 +25,7 @@ NOTE = (
     "its criteria are met. A value without a criterion is for information only."
 )
 # Least share of runs for claims such as "the controller works" or "the weights converge".
-OFTEN = 0.9
+MOST_RUNS = 0.9
 
 
 def judge(
@@ -41,7 +41,7 @@ def judge(
         The number: an `Estimate`; or an array with a value for each run, shape (runs,), of
         which the median is estimated; or an exact number.
     unit
-        Unit of the number.
+        Unit of the number in the report; "" if the number has no unit.
     at_least, at_most
         Lower and upper bound of the number that a claim of the paper asks for. Without any
         bound, the number is for information only, and does not count in the verdict.
@@ -79,7 +79,9 @@ def judge(
     }
 
 
-def judge_share(quantity: str, happened: NDArray[np.bool_], *, often: bool = False) -> Finding:
+def judge_share(
+    quantity: str, happened: NDArray[np.bool_], *, is_criterion: bool = False
+) -> Finding:
     """Return a finding about the share of runs in which something happened, in percent.
 
     Parameters
@@ -88,11 +90,11 @@ def judge_share(quantity: str, happened: NDArray[np.bool_], *, often: bool = Fal
         What happened, in words.
     happened
         Whether it happened in each run, shape (runs,).
-    often
-        Whether the claim asks for a share of at least `OFTEN`. If not, the share is for
+    is_criterion
+        Whether the claim asks for a share of at least `MOST_RUNS`. If not, the share is for
         information only.
     """
-    at_least = 100 * OFTEN if often else -inf
+    at_least = 100 * MOST_RUNS if is_criterion else -inf
     return judge(quantity, share(happened).scaled(100), "% of runs", at_least=at_least)
 
 
@@ -110,8 +112,8 @@ def judge_times(quantity: str, samples: ArrayLike) -> Iterator[Finding]:
 def verdict(findings: Iterable[Finding]) -> str:
     """Return the verdict on a claim in words, from all findings about the claim.
 
-    Findings without a criterion do not count. An undecided finding counts as a criterion that
-    is not met.
+    Findings without a criterion do not count, and an undecided finding counts as a criterion
+    that is not met.
     """
     is_met = [finding["shown"] == "yes" for finding in findings if finding["shown"]]
     if not is_met:
@@ -127,14 +129,8 @@ def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) 
     """Return the table of all findings, with the verdicts on the claims.
 
     The table has a row for each finding about a claim. A claim without findings has one row, in
-    which `runs` is missing.
-
-    Parameters
-    ----------
-    claims
-        The claims by name, each with the attributes `section` and `statement`.
-    findings
-        The findings about each claim, by the name of the claim.
+    which `runs` is missing. `claims` has the claims by name, and `findings` has the findings
+    about each claim by the name of the claim.
     """
     rows: list[dict[str, Any]] = []
     for name, findings_of_claim in findings.items():
@@ -171,7 +167,7 @@ def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
 def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
     """Return findings as a table of text with the columns of the report.
 
-    `rows` are rows of what `table` returns, all with a measured number.
+    `rows` are those rows of the table that `table` returns that have a measured number.
     """
     low = rows["low"].map(_three_digits)
     high = rows["high"].map(_three_digits)

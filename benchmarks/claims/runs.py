@@ -44,9 +44,9 @@ class Batch:
         length
             Number of set points, and of errors, among the inputs of a network.
         in_proportion
-            Whether the learning rates are multiplied by the paper's number of nodes, or inputs,
-            divided by the number in this network. With equal learning rates, a larger network
-            learns faster, as more terms of a sum change at the same time.
+            Whether a network with n times the nodes or inputs of the paper's network has 1 / n
+            of the paper's learning rates. With equal learning rates, a larger network learns
+            faster, as more terms of a sum change at the same time.
         direction
             The sign of the plant's gain that a network assumes: -1, or 1 for the wrong sign.
         """
@@ -125,10 +125,10 @@ class WeightLog:
 def converged_at(weights: Array) -> Array:
     """Return the sample from which on the weights of each run have converged, shape (runs,).
 
-    From this sample on, the Euclidean distance of the weights from their final values is at
-    most `CONVERGED_SHARE` times the distance at the start. If the weights come this close to
-    their final values only in the last `CONVERGED_SAMPLES` samples, they may still be moving
-    when the run ends, and the result is infinite.
+    The weights have converged at a sample if, from this sample on, their Euclidean distance
+    from their final values is at most `CONVERGED_SHARE` times the distance at the start. If
+    they come this close to their final values only in the last `CONVERGED_SAMPLES` samples,
+    they may still be moving when the run ends, and the result is infinite.
 
     Parameters
     ----------
@@ -138,7 +138,8 @@ def converged_at(weights: Array) -> Array:
     samples = len(weights)
     distances = np.linalg.norm(weights - weights[-1], axis=2)
     is_outside = distances > CONVERGED_SHARE * distances[0]
-    # One sample after the last sample outside; 0 if no sample is outside.
-    samples_inside = np.argmax(is_outside[::-1], axis=0)
-    first_inside = np.where(is_outside.any(axis=0), samples - samples_inside, 0)
-    return np.where(first_inside <= samples - CONVERGED_SAMPLES, first_inside, np.inf)
+    # Backwards in time, the first sample outside follows all samples that have converged.
+    converged_samples = np.argmax(is_outside[::-1], axis=0)
+    first_converged = np.where(is_outside.any(axis=0), samples - converged_samples, 0)
+    is_long_enough = first_converged <= samples - CONVERGED_SAMPLES
+    return np.where(is_long_enough, first_converged, np.inf)

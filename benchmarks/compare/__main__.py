@@ -51,7 +51,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run a comparison, write the results, and return a closing line.
+    """Run a comparison, write the results, and return a sentence that says where they are.
 
     If tasks fail or the user interrupts the comparison, the results of the tasks that have
     finished are written before the exception is raised again.
@@ -67,29 +67,31 @@ def work(options: Options) -> str:
     folder_name, scenarios = cases(options)
     target = options.out or Path("results", folder_name)
     provenance = origin()
-    bounds: dict[str, Any] = {}
-    cells: dict[str, Any] = {}
+    # The tasks by name, such as "bounds of square" and "mpc, square".
+    bound_tasks: dict[str, Any] = {}
+    run_tasks: dict[str, Any] = {}
     for scenario in scenarios:
-        bound = partial(scale_of, scenario, options.runs, options.seed)
-        bounds[f"bounds of {scenario.name}"] = bound
+        bound_task = partial(scale_of, scenario, options.runs, options.seed)
+        bound_tasks[f"bounds of {scenario.name}"] = bound_task
     for name, controller in controllers.items():
         for scenario in scenarios:
-            cell = partial(run_case, scenario, controller, options.runs, options.seed)
-            cells[f"{name}, {scenario.name}"] = cell
-    tasks = bounds | cells
-    # Long tasks start first, so that no core waits long at the end.
+            run_task = partial(run_case, scenario, controller, options.runs, options.seed)
+            run_tasks[f"{name}, {scenario.name}"] = run_task
+    tasks = bound_tasks | run_tasks
+    # Long tasks start first, so that no core waits long at the end. The first argument of each
+    # task is a scenario.
     names = sorted(tasks, key=lambda name: -tasks[name].args[0].samples)
     sorted_tasks = {name: tasks[name] for name in names}
-    done: dict[str, Any] = {}
+    finished: dict[str, Any] = {}
     with results_folder(target) as folder:
         try:
-            done.update(options.controllers.fan_out.stream(sorted_tasks, "compare"))
+            finished.update(options.controllers.fan_out.stream(sorted_tasks, "compare"))
         finally:
-            missing = len(tasks) - len(done)
+            missing = len(tasks) - len(finished)
             if missing:
                 provenance["missing"] = f"{missing} of {len(tasks)} tasks are missing"
-            results = [done[name] for name in cells if name in done]
-            scales = [done[name] for name in bounds if name in done]
+            results = [finished[name] for name in run_tasks if name in finished]
+            scales = [finished[name] for name in bound_tasks if name in finished]
             if results:
                 policies = {result.agent: result.policies for result in results}
                 content = {

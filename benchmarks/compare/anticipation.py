@@ -1,12 +1,12 @@
 """Find controllers that act before a square wave changes, and score them in other runs.
 
-A controller anticipates if it acts before a change of the set point. The half period of the
-square wave is the longest time for which a random set point is constant. So a policy that was
-trained with random set points can learn to expect a change after this time. On the square wave,
-such a policy acts before the changes, and the mean error can be smaller than that of the best
-controller without foresight. Since foresight is no skill in control, a report marks controllers
-that anticipate, and scores them in surprising runs: runs with the same seeds, in which nobody
-can foresee when the set point changes.
+A controller anticipates if it acts before a change of the set point. A policy that was trained
+with random set points can learn to expect a change after half a period of the square wave, as
+this is the longest time for which a random set point is constant. On the square wave, a policy
+that expects the changes can have a smaller mean error than the best controller without
+foresight. Since foresight is no skill in control, a report marks controllers that anticipate,
+and scores them in surprising runs: runs with the same seeds, in which nobody can foresee when
+the set point changes.
 """
 
 import itertools
@@ -88,8 +88,6 @@ def anticipation(
 
     Parameters
     ----------
-    scenario
-        The scenario.
     members
         The records of the controller's members, one for each trained network.
     trajectories
@@ -138,12 +136,8 @@ def movement_before_changes(
     set point, or has not reached the set point, does not count as a controller that
     anticipates.
 
-    Parameters
-    ----------
-    scenario
-        The scenario, which has a square wave.
-    trajectories
-        The signals of the runs of each member of the controller.
+    The scenario has a square wave, and `trajectories` has the signals of the runs of each
+    member of the controller.
     """
     window = int(scenario.parameters.range_of("delay")[0]) + 1
     setpoint = trajectories[0].setpoint[:, 0]
@@ -178,7 +172,7 @@ def run_surprised(
     Parameters
     ----------
     scenario
-        The scenario, which has a square wave. The surprising runs have the same plant.
+        A scenario with a square wave, which gives the plant of the surprising runs.
     members
         The records of the controller's members, one for each trained network.
     movement
@@ -186,8 +180,8 @@ def run_surprised(
     seeds
         The seeds of the runs, shape (runs,).
     are_equal
-        Whether nothing is random, so that all runs with one timetable are equal. Each member
-        then runs once with each timetable.
+        Whether nothing but the set point differs between runs, so that one run of each member
+        with each set point is enough.
     """
     errors = []
     least_errors: list[float] = []

@@ -72,15 +72,10 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     """Run all members of a controller in a scenario, and return the results.
 
     If neither the scenario nor the controller uses random numbers, all runs of a member are
-    equal. In this case, each member runs once, and the results have a copy of this run for each
-    seed.
+    equal, so that the member runs once, and the results have a copy of this run for each seed.
 
     Parameters
     ----------
-    scenario
-        The scenario.
-    controller
-        The record of the controller.
     runs
         Number of runs of each member.
     seed
@@ -127,14 +122,8 @@ def responses_over_time(
     members. If the set points are random, the percentiles are those of the first run alone, as
     the runs have different set points.
 
-    Parameters
-    ----------
-    trajectories
-        The signals of a batch of runs for each member of the controller.
-    scenario
-        The scenario.
-    agent
-        The name of the controller in options.
+    `trajectories` has the signals of a batch of runs for each member of the controller, and
+    `agent` is the name of the controller in options.
     """
     setpoint = trajectories[0].setpoint[:, 0]
     k = np.arange(len(setpoint))
@@ -159,7 +148,6 @@ class Scale:
     Attributes
     ----------
     scenario : Scenario
-        The scenario.
     least : LeastPossible
         The least possible error of a controller that does not know future set points.
     preview : float
@@ -176,11 +164,9 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
 
     Parameters
     ----------
-    scenario
-        The scenario.
     runs
-        Number of runs of a controller. The means are over the episodes of these runs, or over
-        the first `EPISODES` of them if there are more, as bounds take long to compute.
+        Number of runs of a controller. The means are over the episodes of all runs, but at most
+        over the first `EPISODES` episodes, as bounds take long to compute.
     seed
         Seed of the first run; run i has the seed `seed + i`.
 
@@ -270,7 +256,7 @@ def estimate(
 
 
 def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Return the errors of each controller's runs, degC, shape (members, runs), by its name.
+    """Return an array of errors for each controller, degC, shape (members, runs), by name.
 
     `runs` has the rows of one scenario, as in `Result`.
     """
@@ -284,10 +270,10 @@ def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
 def misfits_of(
     controllers: Mapping[str, ControllerSpec], plants: Sequence[Parameters]
 ) -> dict[str, str]:
-    """Return a sentence for each controller that does not fit all plants, by its name.
+    """Return a sentence for each controller that does not fit all plants, by controller.
 
-    The sentence says why the controller does not fit the first such plant. `controllers` are
-    records by name, and `plants` are the plants of all scenarios.
+    The sentence says why the controller does not fit the first plant that it does not fit.
+    `controllers` are records by name, and `plants` are the plants of all scenarios.
     """
     misfits: dict[str, str] = {}
     for name, controller in controllers.items():
@@ -301,8 +287,8 @@ def ranked(estimates: pd.DataFrame, misfits: Collection[str]) -> dict[str, Estim
     """Return the overall score of each controller by name, the highest score first.
 
     The overall score is the mean score over all scenarios, members and runs, with the 95 %
-    confidence interval of `bootstrap`. `estimates` is the table of `estimate`. The controllers
-    in `misfits`, which do not fit all plants, come last.
+    confidence interval of `bootstrap`. `estimates` is the table that `estimate` returns. The
+    controllers in `misfits`, which do not fit all plants, come last.
     """
     scores = {
         str(agent): bootstrap(*tables, seed=BOOTSTRAP_SEED)

@@ -1,7 +1,6 @@
 """Draw the pictures of a comparison of controllers.
 
-The title of a picture is a sentence on the results in the picture, such as which controller has
-the highest score. A score is 0 for an idle valve and 1 for the least possible error.
+A score is 0 for an idle valve and 1 for the least possible error.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from matplotlib.ticker import NullLocator
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.controllers.roster import label, looks
-from benchmarks.lib.pictures import DEAD_ZONE, LIMIT, SETPOINT, open_picture
-from benchmarks.lib.statistics import Estimate, written
+from benchmarks.lib.pictures import AT_LEAST, AT_MOST, DEAD_ZONE, LIMIT, SETPOINT, open_picture
+from benchmarks.lib.statistics import Estimate, as_text
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 
@@ -49,7 +48,7 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
     scores : mapping
         The overall score of each controller by name, the highest score first.
     estimates : pandas.DataFrame
-        A row for each scenario and controller, as `comparison.estimate` returns it.
+        The table of `comparison.estimate`.
     path : Path
         The PNG file.
     """
@@ -68,7 +67,7 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
             axes.plot(distance(scenario_scores), rows, **tick)
             axes.plot(distance(score.value), row, color=colour, marker=marker, ms=6.5)
             right_of_axes = (1.01, row)
-            text = written(score.value, ".3f")
+            text = as_text(score.value, ".3f")
             axes.annotate(text, right_of_axes, xycoords=("axes fraction", "data"), va="center")
         axes.set_yticks(range(len(scores)), [label(agent) for agent in scores])
         axes.set_ylim(len(scores) - 0.5, -0.5)  # The first controller has the top row.
@@ -85,7 +84,7 @@ def scores_finding(scores: Mapping[str, Estimate]) -> str:
     `scores` has the overall score of each controller by name, the highest score first.
     """
     names = [label(agent) for agent in scores]
-    values = [written(score.value, ".3f") for score in scores.values()]
+    values = [as_text(score.value, ".3f") for score in scores.values()]
     if len(scores) == 1:
         return f"{names[0]} has a score of {values[0]}"
     finding = f"{names[0]} has the highest score ({values[0]})"
@@ -107,13 +106,13 @@ def scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
 
     `scores` has all scores that are drawn. The axis reaches from the last of `SCORE_TICKS`
     below all scores to the first tick above them. The label of the first or last of
-    `SCORE_TICKS` begins with "≤" or "≥" if scores beyond it are drawn there.
+    `SCORE_TICKS` begins with `AT_MOST` or `AT_LEAST` if scores beyond it are drawn there.
     """
     labels = [f"{score:g}" for score in SCORE_TICKS]
     if min(scores) < LOWEST_SCORE:
-        labels[0] = f"≤ {labels[0]}"
+        labels[0] = f"{AT_MOST} {labels[0]}"
     if max(scores) > HIGHEST_SCORE:
-        labels[-1] = f"≥ {labels[-1]}"
+        labels[-1] = f"{AT_LEAST} {labels[-1]}"
     first = max(int(np.searchsorted(SCORE_TICKS, min(scores), side="right")) - 1, 0)
     last = min(int(np.searchsorted(SCORE_TICKS, max(scores))), len(SCORE_TICKS) - 1)
     ticks = distance(SCORE_TICKS[first : last + 1])
@@ -138,7 +137,6 @@ def plot_responses(
     errors : pandas.Series
         Mean error of each controller in the scenario, degC, by the controller's name.
     scenario : Scenario
-        The scenario in which the controllers ran.
     path : Path
         The PNG file.
     """

@@ -21,11 +21,11 @@ from benchmarks.compare.comparison import (
 from benchmarks.controllers.roster import label
 from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.report import Section, write_report
-from benchmarks.lib.statistics import Estimate, written
+from benchmarks.lib.statistics import Estimate, as_text
 from benchmarks.loop.rollout import RESPONSE_SAMPLES, START_SAMPLES
 from benchmarks.loop.scenarios import Scenario
 
-SCORE = (
+SCORE_TEXT = (
     "The error of a run is the mean of |e| over the samples, where e is the set point minus "
     "the temperature. An idle valve keeps the flow at 0 t/h. The score says which share of the "
     "way from the error of an idle valve to the least possible error a controller covers. "
@@ -33,7 +33,7 @@ SCORE = (
     "interval, and the columns of the cases have the score in each case. The valve travel is "
     "the sum of all changes of the applied flow in a run, as a mean over all runs."
 )
-RATIO = (
+RATIO_TEXT = (
     "An error ratio of 1.00 is best. The first row has the least possible error of a "
     "controller that does not know future set points, and the second row has the least "
     "possible error of a controller that knows them. The mark * means that the plant settles "
@@ -41,11 +41,11 @@ RATIO = (
     "each change comes as a surprise. In a case with the mark *, a controller that has learnt "
     "when the set point changes can have an error ratio below 1.00."
 )
-ANTICIPATES = (
+ANTICIPATION_NOTE = (
     "‡ The controller moves the valve before the square wave changes. Its score in this case "
     "is the score in runs with the same seeds in which nobody can foresee the changes."
 )
-SURPRISED = (
+ANTICIPATION_TEXT = (
     "The controllers in this table move the valve before the square wave changes. The column "
     "'moved before the change' has the share of a set-point change that the temperature makes "
     "before it can respond to the change. The columns 'least possible' and 'with foresight' "
@@ -53,19 +53,19 @@ SURPRISED = (
     "controllers that know them. The last column has the error ratio in runs in which nobody "
     "can foresee the changes."
 )
-PAIRED = (
+DIFFERENCE_TEXT = (
     "The reference is the controller that was named first, here {reference}. A cell has the "
     "error of a controller minus the error of the reference in the same run, in °C: the mean "
     "over the runs, with a 95 % confidence interval. A negative difference means that the "
     "controller has the smaller error. The percentage is the share of the runs in which the "
     "controller has the smaller error."
 )
-HARD = (
+PARTS_TEXT = (
     "The mean error on the preset hard, in °C, is the sum of three contributions: those of the "
     f"first {START_SAMPLES} samples of a run, of the {RESPONSE_SAMPLES} samples after each "
     "later change of the set point, and of the remaining samples."
 )
-COSTS = (
+COSTS_TEXT = (
     "The column 'prior knowledge' says what a controller knows about the plant before a run, "
     "and the column 'searched or trained' says how its settings or weights were found; 1 M "
     "samples are a million samples. Ms is the maximum sensitivity of a control loop, the "
@@ -73,13 +73,13 @@ COSTS = (
     "loop. Ms and the range of delays with which the loop is stable are given for linear "
     "controllers, with the nominal plant of the first case, without dead zone and limits."
 )
-CASES = (
+CASES_TEXT = (
     "Each case is the environment MiddlePoint-v0 with the arguments in the last column; all "
     "other arguments have their default values."
 )
-MOST_ROWS = 8  # largest number of controllers in a picture of temperature and flow over time
-MISFIT = "†"  # marks controllers that were made for another plant
-PARTS = {  # the columns of a part of the mean error, and of the mean error
+MOST_PICTURED = 8  # largest number of controllers in a picture of responses over time
+MISFIT_MARK = "†"  # marks controllers that were made for another plant
+PARTS_OF_ERROR = {  # the columns of a part of the mean error, and of the mean error
     "mae_start": f"first {START_SAMPLES} samples",
     "mae_changes": f"{RESPONSE_SAMPLES} samples after later changes",
     "mae_steady": "remaining samples",
@@ -133,11 +133,11 @@ class Comparison:
         """The names of the controllers that are drawn over time, the best first.
 
         They are the `ranked` controllers, or all controllers if none is ranked. If there are
-        more than `MOST_ROWS`, they are only those whose record has `pictured` true.
+        more than `MOST_PICTURED`, they are only those whose record has `pictured` true.
         """
         names = self.ranked or list(self.scores)
         chosen = [name for name in names if self.controllers[name].pictured]
-        if len(names) > MOST_ROWS and chosen:
+        if len(names) > MOST_PICTURED and chosen:
             return chosen
         return names
 
@@ -151,19 +151,9 @@ def write(
 ) -> None:
     """Write the CSV files, pictures and report of a comparison, and print the main tables.
 
-    Parameters
-    ----------
-    results
-        The results of each controller in each scenario.
-    scales
-        The least possible errors of the scenarios. A scenario whose least possible errors are
-        missing is in the CSV files, but not in the report.
-    controllers
-        The record of each controller by name.
-    folder
-        The folder to write to.
-    origin
-        The provenance of the results, as `provenance.origin` returns it.
+    A scenario that is not in `scales`, since its least possible errors are missing, is in the
+    CSV files, but not in the report. `controllers` has the record of each controller by name,
+    and `origin` is the provenance of the results, as `provenance.origin` returns it.
     """
     runs = pd.concat([result.runs for result in results], ignore_index=True)
     write_numbers(folder / "runs.csv", runs)
@@ -173,8 +163,10 @@ def write(
         tables = [result.responses for result in results if result.scenario == name]
         responses[name] = pd.concat(tables)
         write_numbers(folder / f"{name}.csv", responses[name])
-    scale_of = {scale.scenario.name: scale for scale in scales}
-    scale_of = {name: scale for name, scale in scale_of.items() if name in responses}
+    # The report has the scenarios with both results and least possible errors.
+    scale_of = {
+        scale.scenario.name: scale for scale in scales if scale.scenario.name in responses
+    }
     runs = runs[runs["scenario"].isin(list(scale_of))]
     if runs.empty:
         return
@@ -202,17 +194,10 @@ def write(
 
 
 def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:
-    """Draw the scores, and the temperature and flow over time in each scenario.
+    """Draw PNG files of the scores, and of temperature and flow over time in each scenario.
 
-    Parameters
-    ----------
-    comparison
-        The results.
-    responses
-        The tables `responses` of `comparison.Result` for all controllers, by the name of the
-        scenario.
-    folder
-        The folder of the PNG files.
+    `responses` has a table for each scenario, by its name, which joins the tables
+    `Result.responses` of all controllers.
     """
     scores = {name: comparison.scores[name] for name in comparison.ranked}
     if scores:
@@ -226,39 +211,39 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
 
 
 def sections(comparison: Comparison) -> list[Section]:
-    """Return the sections of the report, without those whose table has no row."""
+    """Return the sections of the report, but no section with an empty table."""
     reference = label(str(comparison.runs["agent"].iloc[0]))
     scenarios = [scale.scenario for scale in comparison.scales.values()]
     candidates = [
         Section(
             "Score: 0 for an idle valve, 1 for the least possible error",
-            [SCORE, *notes(comparison)],
+            [SCORE_TEXT, *notes(comparison)],
             score_table(comparison),
             pictures={"scores.png": "The score of each controller, and its score in each case"},
         ),
         Section(
             "Error ratio: mean error / least possible error, with a 95 % confidence interval",
-            [RATIO],
+            [RATIO_TEXT],
             ratio_table(comparison),
         ),
         Section(
             "Anticipation: controllers that act before the square wave changes",
-            [SURPRISED],
+            [ANTICIPATION_TEXT],
             anticipation_table(comparison),
         ),
         Section(
             f"Difference to the error of the reference: {reference}",
-            [PAIRED.format(reference=reference)],
+            [DIFFERENCE_TEXT.format(reference=reference)],
             difference_table(comparison),
         ),
         Section(
             "Where the error arises on the preset hard",
-            [HARD],
+            [PARTS_TEXT],
             parts_table(comparison.runs),
         ),
         Section(
             "What each controller knows and costs",
-            [COSTS],
+            [COSTS_TEXT],
             costs_table(comparison.results, comparison.controllers, scenarios[0]),
         ),
         Section(
@@ -271,7 +256,7 @@ def sections(comparison: Comparison) -> list[Section]:
             },
         ),
     ]
-    marks = {label(name): f"{label(name)} {MISFIT}" for name in comparison.misfits}
+    marks = {label(name): f"{label(name)} {MISFIT_MARK}" for name in comparison.misfits}
     filled = []
     for section in candidates:
         table: Any = section.table
@@ -295,20 +280,21 @@ def notes(comparison: Comparison) -> list[str]:
         if "note" in policy
     }
     if comparison.anticipations:
-        texts.add(ANTICIPATES)
+        texts.add(ANTICIPATION_NOTE)
     not_ranked = [
-        f"{MISFIT} {reason} So its error is no measure of the controller, which is not ranked."
+        f"{MISFIT_MARK} {reason} So its error says little about the controller, which is not "
+        "ranked."
         for reason in comparison.misfits.values()
     ]
     return [*sorted(texts), *not_ranked]
 
 
 def notes_on_cases(comparison: Comparison, scenarios: Sequence[Scenario]) -> list[str]:
-    """Return the paragraphs above the table of cases: what it has, and who is in the pictures.
+    """Return paragraphs that explain the table of cases, and name the pictured controllers.
 
     `scenarios` are all scenarios of the report.
     """
-    texts = [CASES]
+    texts = [CASES_TEXT]
     if any("Figs" in scenario.title for scenario in scenarios):
         texts.append("Figs are the figures of the paper by Cui and Shin (1992).")
     if len(comparison.pictured) < len(comparison.controllers):
@@ -325,8 +311,8 @@ def score_table(comparison: Comparison) -> pd.DataFrame:
     """
     estimates = comparison.estimates
     agents = list(comparison.scores)
-    cells = estimates["scores"].map(lambda scores: written(scores.mean(), ".2f"))
-    table = _by_agent(estimates, cells + estimates["mark"], agents)
+    cells = estimates["scores"].map(lambda scores: as_text(scores.mean(), ".2f"))
+    table = table_by_agent(estimates, cells + estimates["mark"], agents)
     travels = comparison.runs.groupby(["agent", "scenario"])["total_variation"].mean()
     overall = []
     for agent, score in comparison.scores.items():
@@ -348,7 +334,7 @@ def ratio_table(comparison: Comparison) -> pd.DataFrame:
         bounds[name] = [f"{scale.least.value:.3f}{mark}", f"{scale.preview:.3f}"]
     estimates = comparison.estimates
     cells = estimates["ratio"].map("{:.2f}".format) + estimates["mark"]
-    ratios = _by_agent(estimates, cells, list(comparison.scores))
+    ratios = table_by_agent(estimates, cells, list(comparison.scores))
     return pd.concat([bounds, ratios], ignore_index=True)
 
 
@@ -388,20 +374,17 @@ def difference_table(comparison: Comparison) -> pd.DataFrame:
     compared = comparison.estimates.dropna(subset=["difference"])
     differences = compared["difference"].map("{:+.3f}".format)
     shares = compared["improvement"].map(lambda share: f"{100 * share.value:.0f} %")
-    return _by_agent(compared, differences + "; " + shares, list(compared["agent"].unique()))
+    return table_by_agent(
+        compared, differences + "; " + shares, list(compared["agent"].unique())
+    )
 
 
-def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
+def table_by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
     """Return a table of texts, with a row for each controller and a column for each scenario.
 
-    Parameters
-    ----------
-    rows
-        A table with the columns `scenario` and `agent` (the controller), one row for each cell.
-    cells
-        The texts of the cells, in the order of `rows`.
-    agents
-        The names of the controllers, in the order of the rows of the result.
+    `rows` has a row for each cell, with the columns `scenario` and `agent` (the controller).
+    `cells` has the texts of the cells in the order of `rows`. The rows of the result have the
+    order of `agents`.
     """
     table = rows.assign(cell=cells).pivot(index="agent", columns="scenario", values="cell")
     table = table.loc[list(agents), rows["scenario"].unique()].fillna("").rename(index=label)
@@ -411,12 +394,16 @@ def _by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataF
 def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a table of texts with the parts of the mean error in the scenario `hard`, degC.
 
-    `PARTS` has the parts. There is a row for each controller, the smallest mean error first.
-    `runs` has a row for each run, as in `comparison.Result`.
+    There is a column for each of `PARTS_OF_ERROR`, and a row for each controller, the smallest
+    mean error first. `runs` has a row for each run, as in `comparison.Result`.
     """
-    means = runs[runs["scenario"] == "hard"].groupby("agent")[list(PARTS)].mean()
+    means = runs[runs["scenario"] == "hard"].groupby("agent")[list(PARTS_OF_ERROR)].mean()
     texts = means.sort_values("mae").map("{:.3f}".format)
-    return texts.rename(index=label, columns=PARTS).rename_axis("controller").reset_index()
+    return (
+        texts.rename(index=label, columns=PARTS_OF_ERROR)
+        .rename_axis("controller")
+        .reset_index()
+    )
 
 
 def cases_table(scenarios: Sequence[Scenario]) -> pd.DataFrame:
@@ -439,36 +426,30 @@ def costs_table(
 ) -> pd.DataFrame:
     """Return a table of texts on knowledge, robustness and costs, a row for each controller.
 
-    Parameters
-    ----------
-    results
-        The results of each controller in each scenario, which have the processor times.
-    controllers
-        The record of each controller by name, in the order of the rows.
-    scenario
-        The scenario for whose nominal plant the robustness of linear controllers is computed.
+    `results` has the processor times, and `controllers` the records of the controllers by name.
+    The robustness of linear controllers is computed with the nominal plant of `scenario`.
     """
     rows = []
     for name, controller in controllers.items():
-        of_controller = [result for result in results if result.agent == name]
-        # A user's own controller says in its provenance what the roster says of a controller.
-        policies = [policy for result in of_controller for policy in result.policies]
+        own_results = [result for result in results if result.agent == name]
+        # The record of a user's own controller has no texts; its provenance may have them.
+        policies = [policy for result in own_results for policy in result.policies]
         provenance = policies[0] if policies else {}
-        sensitivity, delays = robustness(controller, scenario)
+        sensitivity, delays = robustness_texts(controller, scenario)
         row = {
             "controller": label(name),
             "prior knowledge": controller.knows or provenance.get("knows", ""),
             "Ms": sensitivity,
             "stable with delays of (samples)": delays,
             "searched or trained": controller.searched or provenance.get("searched", ""),
-            "processor time (s)": f"{sum(result.seconds for result in of_controller):.1f}",
+            "processor time (s)": f"{sum(result.seconds for result in own_results):.1f}",
         }
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def robustness(controller: ControllerSpec, scenario: Scenario) -> tuple[str, str]:
-    """Return two texts on the robustness of a controller's loop, or two empty texts.
+def robustness_texts(controller: ControllerSpec, scenario: Scenario) -> tuple[str, str]:
+    """Return two texts on the robustness of a controller's loop; two empty texts if unknown.
 
     The first text is Ms, the maximum sensitivity of the loop with the nominal plant of the
     scenario, and the second text is the range of the delays, in samples, with which the loop is
@@ -479,5 +460,6 @@ def robustness(controller: ControllerSpec, scenario: Scenario) -> tuple[str, str
     loop = controller.loop(scenario.arguments)
     delays = loop.stable_delays()
     if delays is None:
-        return "unstable", "none around the plant's"
-    return f"{loop.sensitivity():.2f}", f"{delays[0]} to {delays[1]}"
+        return "unstable", "none"
+    shortest, longest = delays
+    return f"{loop.sensitivity():.2f}", f"{shortest} to {longest}"

@@ -1,6 +1,6 @@
 """List the controllers that the commands can run, as records of the class `ControllerSpec`.
 
-The commands `compare`, `sweep`, `tune` and `watch` can run each controller in this list. The
+The commands `compare`, `sweep`, `tune` and `watch` can run each controller of the roster. The
 option `--agent NAME=MODULE:FACTORY` makes a record for a user's own controller.
 """
 
@@ -65,10 +65,10 @@ def with_bank(
 
 
 def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
-    """Return the paper's network, trained on a plant, with further learning switched off.
+    """Return the paper's networks for a batch of runs, trained on a plant and then frozen.
 
-    `parameters` are the arguments of the environment, `num_envs` is the number of runs in a
-    batch, and the initial weights of run i have the seed `seed + i`.
+    `parameters` are the arguments of the environment, `num_envs` is the number of runs, and the
+    initial weights of run i have the seed `seed + i`.
     """
     controller: Any = ROSTER["nn"].in_service(asdict(parameters), num_envs, seed)
     controller.learning = False
@@ -89,12 +89,14 @@ def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
 def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -> Agent:
     """Return a trained policy, adapted to the actuator of a plant.
 
+    The returned policy has the limits of the plant. If it compensates a dead zone, it
+    compensates the dead zone of the plant in place of the dead zone in its training, unless the
+    dead zone of the plant has a range.
+
     Parameters
     ----------
     parameters
-        The arguments of the environment. If the policy compensates a dead zone, and if the dead
-        zone of the plant is a single number, the policy compensates the plant's dead zone.
-        Otherwise, the policy is as it was in its training.
+        The arguments of the environment.
     network
         The trained policy.
     limits
@@ -116,17 +118,21 @@ def trained(kind: type[PolicyNetwork | RecurrentNetwork], files: str) -> Mapping
     return {file.name: kind.load(file) for file in PRETRAINED.glob(files)}
 
 
-_STEP_TEST = "gain, time constant, delay"
-_DATA_SHEET = f"{_STEP_TEST}, dead zone, limits"
-_NN_KNOWS = "sign of the gain; settings searched on the paper's plant"
-_NN = (
+# What a controller knows, and how it was searched or trained, in words for reports. In reports,
+# 1 M samples are a million samples.
+_KNOWS_STEP_TEST = "gain, time constant, delay"
+_KNOWS_DATA_SHEET = f"{_KNOWS_STEP_TEST}, dead zone, limits"
+_KNOWS_SIGN = "sign of the gain; settings searched on the paper's plant"
+_NN_SEARCH = (
     "25 weights in the run itself; 6 settings by the search of version 0.1; the present search "
     "takes 800 trials: 566 M samples, 6 min"
 )
-_HOLDS = "hold times of random set points"
-_LAW = "8,313 weights for all plants: 12.8 M samples a network, 5 min; 90 settings by hand"
-_RULE = f"one time constant, by a tuning rule and an Ms of {ROBUSTNESS:g}; one step test"
-_NETWORK = partial(trained, RecurrentNetwork, "neural-[0-9]*.npz")
+_KNOWS_HOLDS = "hold times of random set points"
+_NETWORK_TRAINING = (
+    "8,313 weights for all plants: 12.8 M samples a network, 5 min; 90 settings by hand"
+)
+_TUNING_RULE = f"one time constant, by a tuning rule and an Ms of {ROBUSTNESS:g}; one step test"
+_NETWORKS = partial(trained, RecurrentNetwork, "neural-[0-9]*.npz")
 _SPECS = (
     ControllerSpec(
         name="idle",
@@ -145,8 +151,8 @@ _SPECS = (
         look=("#D55E00", "o"),
         build=DirectNNController,
         prior_knowledge=DIRECTION,
-        knows=_NN_KNOWS,
-        searched=_NN,
+        knows=_KNOWS_SIGN,
+        searched=_NN_SEARCH,
         assumes=("scale",),
         random=True,
         learns=True,
@@ -159,8 +165,8 @@ _SPECS = (
         look=("#7A3600", "o"),
         build=frozen_nn,
         prior_knowledge=EVERYTHING,
-        knows=_NN_KNOWS,
-        searched=f"{_NN}; 1,200 samples of learning before the run",
+        knows=_KNOWS_SIGN,
+        searched=f"{_NN_SEARCH}; 1,200 samples of learning before the run",
         assumes=("scale",),
         random=True,
         compared=False,
@@ -183,8 +189,8 @@ _SPECS = (
         look=("#9B2F8C", "h"),
         build=PIController.simc,
         prior_knowledge=STEP_TEST,
-        knows=_STEP_TEST,
-        searched=_RULE,
+        knows=_KNOWS_STEP_TEST,
+        searched=_TUNING_RULE,
         tuned_by="closed_loop_time_constant",
         linear=True,
     ),
@@ -206,8 +212,8 @@ _SPECS = (
         look=("#56B4E9", "^"),
         build=SmithPredictor,
         prior_knowledge=DATA_SHEET,
-        knows=_DATA_SHEET,
-        searched=_RULE,
+        knows=_KNOWS_DATA_SHEET,
+        searched=_TUNING_RULE,
         tuned_by="closed_loop_time_constant",
         linear=True,
     ),
@@ -217,8 +223,8 @@ _SPECS = (
         look=("#003F7D", "<"),
         build=dahlin,
         prior_knowledge=DATA_SHEET,
-        knows=_DATA_SHEET,
-        searched=f"{_RULE}; lambda a tenth of the time constant",
+        knows=_KNOWS_DATA_SHEET,
+        searched=f"{_TUNING_RULE}; closed-loop time constant by hand: a tenth of the plant's",
         tuned_by="filter_time_constant",
         linear=True,
         spans=plant_scale.dahlin_spans,
@@ -230,7 +236,7 @@ _SPECS = (
         look=("#5FCF9F", "v"),
         build=partial(with_bank, SelfTuningController),
         prior_knowledge=BANK,
-        knows=f"{_DATA_SHEET}; delay range; {_HOLDS}",
+        knows=f"{_KNOWS_DATA_SHEET}; delay range; {_KNOWS_HOLDS}",
         searched="about 70 settings by hand; one step test",
     ),
     ControllerSpec(
@@ -275,9 +281,9 @@ _SPECS = (
         look=("#0072B2", "^"),
         build=NeuralSmithPredictor,
         prior_knowledge=(*DATA_SHEET, *SETPOINT),
-        knows=f"{_DATA_SHEET}; {_HOLDS}",
-        searched=f"{_LAW}; one step test",
-        networks=_NETWORK,
+        knows=f"{_KNOWS_DATA_SHEET}; {_KNOWS_HOLDS}",
+        searched=f"{_NETWORK_TRAINING}; one step test",
+        networks=_NETWORKS,
         networks_are_alike=True,
         pictured=True,
     ),
@@ -287,9 +293,9 @@ _SPECS = (
         look=("#005A3C", "v"),
         build=partial(with_bank, NeuralSelfTuningController),
         prior_knowledge=BANK,
-        knows=f"{_DATA_SHEET}; delay range; {_HOLDS}",
-        searched=f"{_LAW}; one step test",
-        networks=_NETWORK,
+        knows=f"{_KNOWS_DATA_SHEET}; delay range; {_KNOWS_HOLDS}",
+        searched=f"{_NETWORK_TRAINING}; one step test",
+        networks=_NETWORKS,
         networks_are_alike=True,
     ),
 )

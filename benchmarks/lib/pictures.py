@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 COLOURS = "#0072B2", "#D55E00"  # of lines that do not belong to a controller
 WIDTH = 7.5  # of a picture, inches: 975 pixels at 130 dots per inch
 TITLE_CHARACTERS = 90  # per line of a title: as many as fit in the width of a picture
-PALETTE = 128  # number of colours in a PNG file; fewer colours make the file smaller
+PALETTE_SIZE = 128  # number of colours in a PNG file; fewer colours make the file smaller
 # matplotlib's `rcParams` for all pictures.
 STYLE: Any = {
     "axes.grid": True,
@@ -45,6 +45,10 @@ STYLE: Any = {
 SETPOINT: Any = {"color": "black", "linestyle": "--", "linewidth": 0.8}
 DEAD_ZONE: Any = {"color": "0.5", "alpha": 0.2, "linewidth": 0}
 LIMIT: Any = {"color": "0.4", "linestyle": ":", "linewidth": 1.0}
+
+# The signs for "at most" and "at least" at the ticks of an axis.
+AT_MOST = "\N{LESS-THAN OR EQUAL TO}"
+AT_LEAST = "\N{GREATER-THAN OR EQUAL TO}"
 
 RATIO_LABEL = (
     "error ratio: mean error / least possible error\n(axis logarithmic in the ratio minus 1)"
@@ -90,7 +94,7 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()  # `Figure.savefig` would draw twice because of the layout.
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    picture.quantize(PALETTE, Image.Quantize.FASTOCTREE).save(path)
+    picture.quantize(PALETTE_SIZE, Image.Quantize.FASTOCTREE).save(path)
 
 
 def excess(ratios: ArrayLike) -> NDArray[np.float64]:
@@ -105,14 +109,14 @@ def scale_by_ratio(axes: Axes, ratios: ArrayLike) -> None:
     """Make the y axis of `excess(ratios)` logarithmic, with error ratios at its ticks.
 
     `ratios` are all error ratios in the panel, which set the ends of the axis. If a ratio is
-    below `RATIO_FLOOR`, the label of the lowest tick is "≤ 1.001" in place of "1.001".
+    below `RATIO_FLOOR`, the label of the lowest tick says "at most 1.001", with a sign.
     """
     from matplotlib.ticker import NullLocator
 
     heights = excess(ratios)
     labels = [f"{ratio:g}" for ratio in RATIO_TICKS]
     if np.min(ratios) < RATIO_FLOOR:
-        labels[0] = f"≤ {labels[0]}"
+        labels[0] = f"{AT_MOST} {labels[0]}"
     axes.set_yscale("log")
     axes.set_yticks(excess(RATIO_TICKS), labels)
     axes.yaxis.set_minor_locator(NullLocator())

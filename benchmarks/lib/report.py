@@ -82,7 +82,7 @@ def write_report(
 def _in_markdown(section: Section, folder: Path) -> list[str]:
     """Return a section as blocks of Markdown, such as a heading, a paragraph or a table.
 
-    Of the pictures of the section, those are included whose PNG files are in `folder`.
+    A picture whose PNG file is not in `folder` is left out.
     """
 
     def cell(text: object) -> str:
@@ -111,7 +111,7 @@ def escape(text: object) -> str:
     escaped = " ".join(str(text).split()).replace("\\", "\\\\")
     escaped = escaped.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     escaped = escaped.replace("|", "\\|").replace("](", "]\\(")
-    for mark in "*_`":  # A single mark has no meaning, two enclose a text.
+    for mark in "*_`":  # A single mark has no meaning in Markdown, but a pair of marks has.
         if escaped.count(mark) > 1:
             escaped = escaped.replace(mark, f"\\{mark}")
     return escaped
@@ -122,8 +122,10 @@ def _source(origin: Mapping[str, Any]) -> str:
 
     `origin` is the provenance of the results, as `provenance.origin` returns it.
     """
-    commit = origin["commit"]  # a hash of 40 digits, "-dirty" after it or not; or ""
-    version = f"commit {commit[:12]}{commit[40:]}" if commit else f"code {origin['code'][:12]}"
+    version = f"code {origin['code'][:12]}"
+    commit = origin["commit"]  # 40 digits, and "-dirty" if files have changed; "" without git
+    if commit:
+        version = f"commit {commit[:12]}{commit[40:]}"
     command = origin["command"] or "called from Python"
     return f"{origin['started']}, {version}: {command}"
 

@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # SciPy loads its modules on first use.
 from numpy.typing import ArrayLike, NDArray
 
-ENDS = 0.025, 0.975  # the quantiles that are the ends of a 95 % interval
+INTERVAL_ENDS = 0.025, 0.975  # the quantiles that are the ends of a 95 % interval
 RESAMPLES = 2000  # of a bootstrap: the noise of the resampling is small beside the interval
 
 
@@ -32,7 +32,7 @@ class Estimate:
     runs: int
 
     def scaled(self, factor: float) -> "Estimate":
-        """Return the estimate with value, low and high multiplied by `factor`, above 0."""
+        """Return the estimate with value and interval multiplied by `factor`, above 0."""
         return Estimate(factor * self.value, factor * self.low, factor * self.high, self.runs)
 
     def __format__(self, form: str) -> str:
@@ -42,9 +42,9 @@ class Estimate:
         as texts, the result is "value" alone. If `high` is infinite, the result is
         "value (one run)".
         """
-        value = written(self.value, form)
-        low = written(self.low, form)
-        high = written(self.high, form)
+        value = as_text(self.value, form)
+        low = as_text(self.low, form)
+        high = as_text(self.high, form)
         if math.isinf(self.high):
             return f"{value} (one run)"
         if low == high:
@@ -52,12 +52,11 @@ class Estimate:
         return f"{value} ({low} to {high})"
 
 
-def written(value: float, form: str) -> str:
+def as_text(value: float, form: str) -> str:
     """Return a number as text in a format such as ".3f", with "0.000" in place of "-0.000"."""
     text = format(value, form)
-    if set(text) <= set("-0."):
-        return text.lstrip("-")
-    return text
+    is_zero = set(text) <= set("-0.")
+    return text.lstrip("-") if is_zero else text
 
 
 def student(values: ArrayLike) -> Estimate:
@@ -73,7 +72,7 @@ def student(values: ArrayLike) -> Estimate:
         return Estimate(mean, mean, mean, runs)
     standard_error = float(numbers.std(ddof=1)) / math.sqrt(runs)
     # The quantile of scipy.stats.t, which takes long to import.
-    half_width = float(scipy.special.stdtrit(runs - 1, ENDS[1])) * standard_error
+    half_width = float(scipy.special.stdtrit(runs - 1, INTERVAL_ENDS[1])) * standard_error
     return Estimate(mean, mean - half_width, mean + half_width, runs)
 
 
@@ -140,7 +139,7 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
         member_indices = generator.integers(members, size=(RESAMPLES, members, 1))
         run_indices = generator.integers(runs, size=(RESAMPLES, 1, runs))
         resamples.append(table[member_indices, run_indices].reshape(RESAMPLES, -1))
-    low, high = np.quantile(np.hstack(resamples).mean(axis=-1), ENDS)
+    low, high = np.quantile(np.hstack(resamples).mean(axis=-1), INTERVAL_ENDS)
     return Estimate(mean, float(low), float(high), all_values.size)
 
 

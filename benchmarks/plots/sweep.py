@@ -1,8 +1,7 @@
 """Draw the results of a sweep, which runs controllers on many plants.
 
 Plants that differ in delay and gain are drawn as a map, and other plants as a curve of the
-sorted errors. An error ratio is a mean error divided by the least possible mean error. The
-title of a picture is a sentence on the results in it.
+sorted error ratios. An error ratio is a mean error divided by the least possible mean error.
 """
 
 from __future__ import annotations
@@ -30,17 +29,23 @@ from benchmarks.lib.pictures import (
 )
 from mptc_gym import Parameters
 
-NEAR = 1.05  # largest error ratio that counts as near the least possible error
-OFTEN = 0.5  # smallest share of the runs on a plant that fail for a mark in the map
+NEAR_RATIO = 1.05  # largest error ratio that counts as near the least possible error
+MARKED_SHARE = 0.5  # smallest share of the runs on a plant that fail for a mark in the map
 MOST_COLUMNS = 3  # number of maps in a row
-CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
+RATIO_CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
 COLOUR_MAP = "viridis_r"  # light for small error ratios, dark for large ones
-NO_RATIO = "0.85"  # colour of a plant without a least possible error
+NO_RATIO_COLOUR = "0.85"  # colour of a plant without a least possible error
 # The mark of a plant on which the loop oscillates.
-OSCILLATES: Any = {"color": "white", "marker": "o", "mec": "black", "ms": 3, "linestyle": ""}
-USELESS = "#E31A1C"  # colour of a plant on which control is no better than an idle valve
+OSCILLATION_MARK: Any = {
+    "color": "white",
+    "marker": "o",
+    "mec": "black",
+    "ms": 3,
+    "linestyle": "",
+}
+USELESS_COLOUR = "#E31A1C"  # colour of a plant on which control is no better than an idle valve
 # The mark of the nominal plant.
-NOMINAL: Any = {"color": "black", "marker": "+", "ms": 12, "mew": 1.8, "linestyle": ""}
+NOMINAL_MARK: Any = {"color": "black", "marker": "+", "ms": 12, "mew": 1.8, "linestyle": ""}
 
 
 def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
@@ -116,30 +121,26 @@ def sorted_finding(plants: pd.DataFrame) -> str:
     if ratios.empty:
         return "No plant has a least possible error"
     texts = [f"{ratio:.2f} for {label(str(agent))}" for agent, ratio in ratios.items()]
+    *smallest, largest = texts
     finding = "On nine plants out of ten, the error ratio is at most "
-    finding += ", ".join(texts[:-1][:2])
-    if len(texts) > 1:
-        finding += " and "
-    return finding + texts[-1]
+    if smallest:
+        finding += f"{', '.join(smallest[:2])} and "
+    return finding + largest
 
 
 def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     """Draw maps of the error ratio over delay and gain, one map for each controller.
 
-    Parameters
-    ----------
-    plants
-        The table of `plant_medians`. The maps have the order of the controllers in the table.
-    path
-        The PNG file.
-    nominal
-        The nominal plant, which each map marks.
+    `plants` is the table of `plant_medians`, in the order of the maps. `path` is the PNG file.
+    Each map has a mark at the nominal plant.
     """
     agents = list(plants["agent"].unique())
     columns = min(MOST_COLUMNS, len(agents))
     rows = math.ceil(len(agents) / columns)
-    classes = BoundaryNorm(CLASSES, ncolors=256, extend="max")
-    centre = [sum(nominal.range_of(name)) / 2.0 for name in ("delay", "gain_factor")]
+    classes = BoundaryNorm(RATIO_CLASSES, ncolors=256, extend="max")
+    # If the nominal plant has ranges, its mark is in the middle.
+    nominal_delay = np.mean(nominal.range_of("delay"))
+    nominal_gain = np.mean(nominal.range_of("gain_factor"))
     height = 1.5 + 1.9 * rows  # inches: title, legend and colour bar, and the rows
     with open_picture(path, height, map_finding(plants)) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
@@ -149,7 +150,7 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
             axes = panels[number]
             axes.set_title(label(agent))
             _draw_controller(axes, plants[plants["agent"] == agent], classes)
-            axes.plot(*centre, **NOMINAL)
+            axes.plot(nominal_delay, nominal_gain, **NOMINAL_MARK)
             if number % columns == 0:
                 axes.set_ylabel("gain factor")
             if number >= len(agents) - columns:  # no panel below this one
@@ -165,25 +166,26 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
             aspect=60,
         )
         bar.set_label("error ratio: mean error / least possible error")
-        bar.set_ticks(CLASSES, labels=[f"{ratio:g}" for ratio in CLASSES])
+        bar.set_ticks(RATIO_CLASSES, labels=[f"{ratio:g}" for ratio in RATIO_CLASSES])
 
 
 def map_finding(plants: pd.DataFrame) -> str:
     """Return the title of the maps: a sentence on plants with nearly the least possible error.
 
-    The sentence names the two controllers that have an error ratio of at most `NEAR` on the
-    largest shares of the plants. `plants` is the table of `plant_medians`.
+    The sentence names the two controllers that have an error ratio of at most `NEAR_RATIO` on
+    the largest shares of the plants, and says what share all other controllers reach at most.
+    `plants` is the table of `plant_medians`.
     """
-    with_ratio = plants.dropna(subset=["ratio"])
-    is_near = with_ratio["ratio"] <= NEAR
-    shares = is_near.groupby(with_ratio["agent"]).mean()
+    bounded = plants.dropna(subset=["ratio"])  # plants with a least possible error
+    is_near = bounded["ratio"] <= NEAR_RATIO
+    shares = is_near.groupby(bounded["agent"]).mean()
     shares = shares.sort_values(ascending=False, kind="stable")
     if shares.empty:
         return "Where each controller oscillates"
     names = [label(str(agent)) for agent in shares.index]
     percentages = [percent(share) for share in shares]
     finding = (
-        f"{names[0]} is within {percent(NEAR - 1.0)} of the least possible error on "
+        f"{names[0]} is within {percent(NEAR_RATIO - 1.0)} of the least possible error on "
         f"{percentages[0]} of the plants"
     )
     if len(names) > 1:
@@ -196,24 +198,20 @@ def map_finding(plants: pd.DataFrame) -> str:
 def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) -> None:
     """Draw the map of one controller: a cell for each plant, and marks where control fails.
 
-    Parameters
-    ----------
-    axes
-        The panel of the map.
-    plants
-        The rows of `plant_medians` of one controller.
-    classes
-        The normalisation that maps an error ratio to a colour.
+    `plants` are the rows of `plant_medians` with this controller, and `classes` maps an error
+    ratio to its class of colours.
     """
     cells = plants.pivot(index="gain_factor", columns="delay", values=["ratio", "useless"])
     ratios = cells["ratio"]
-    useless = cells["useless"].where(cells["useless"] >= OFTEN)  # NaN is transparent
-    axes.set_facecolor(NO_RATIO)
+    useless = cells["useless"].where(cells["useless"] >= MARKED_SHARE)  # NaN is transparent
+    axes.set_facecolor(NO_RATIO_COLOUR)
     axes.grid(visible=False)
     axes.pcolormesh(ratios.columns, ratios.index, ratios, norm=classes, cmap=COLOUR_MAP)
-    axes.pcolormesh(ratios.columns, ratios.index, useless, cmap=ListedColormap([USELESS]))
-    marked = plants[(plants["oscillates"] >= OFTEN) & (plants["useless"] < OFTEN)]
-    axes.plot(marked["delay"], marked["gain_factor"], **OSCILLATES)
+    axes.pcolormesh(
+        ratios.columns, ratios.index, useless, cmap=ListedColormap([USELESS_COLOUR])
+    )
+    marked = plants[(plants["oscillates"] >= MARKED_SHARE) & (plants["useless"] < MARKED_SHARE)]
+    axes.plot(marked["delay"], marked["gain_factor"], **OSCILLATION_MARK)
 
 
 def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
@@ -221,11 +219,11 @@ def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
 
     `plants` is the table of `plant_medians` with all controllers.
     """
-    entries: dict[str, Artist] = {"the nominal plant": Line2D([], [], **NOMINAL)}
-    if (plants["oscillates"] >= OFTEN).any():
-        entries["oscillation in most runs"] = Line2D([], [], **OSCILLATES)
-    if (plants["useless"] >= OFTEN).any():
-        entries["no better than an idle valve in most runs"] = Patch(color=USELESS)
+    entries: dict[str, Artist] = {"the nominal plant": Line2D([], [], **NOMINAL_MARK)}
+    if (plants["oscillates"] >= MARKED_SHARE).any():
+        entries["oscillation in most runs"] = Line2D([], [], **OSCILLATION_MARK)
+    if (plants["useless"] >= MARKED_SHARE).any():
+        entries["no better than an idle valve in most runs"] = Patch(color=USELESS_COLOUR)
     if plants["ratio"].isna().any():
-        entries["least possible error unknown"] = Patch(color=NO_RATIO)
+        entries["least possible error unknown"] = Patch(color=NO_RATIO_COLOUR)
     return entries
