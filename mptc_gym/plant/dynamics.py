@@ -318,7 +318,7 @@ class PlantBatch:
         # Times of the drifts, in samples since the plants were created: the present time, the
         # start of each plant's episode, and when the dynamics of some plant change next.
         self._clock = 0
-        self._starts = np.zeros((), np.int64)
+        self._starts: NDArray[np.int64] = np.zeros((), np.int64)
         if parameters.drifts:
             self._starts = np.zeros(num_envs, np.int64)
         self._next_update = 0
