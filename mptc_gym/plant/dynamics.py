@@ -120,11 +120,8 @@ class Dynamics:
         if parameters.changes_time_constant:
             pole = slowest_pole(parameters.a).real  # a real one, as Parameters has checked
             self._rate = 1.0 - pole
-            quotient = 0.0
-            for coefficient in parameters.a[:-1]:  # A / (1 - p z^-1) by Horner's scheme
-                quotient = coefficient + pole * quotient
-                self._quotient.append(quotient)
-            self._quotient.append(0.0)
+            quotient, _remainder = np.polydiv(parameters.a, [1.0, -pole])
+            self._quotient = [*quotient.tolist(), 0.0]
 
     def drift_share(self, age: Any) -> Any:
         """Return which share of the drifts of gain and time constant is complete at k = `age`.
