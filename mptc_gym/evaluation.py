@@ -16,7 +16,6 @@ from mptc_gym.environments.layers import plant_groups
 from mptc_gym.plant.checks import MOST_PLANTS, count
 from mptc_gym.plant.dynamics import action_from_command
 from mptc_gym.plant.parameters import ARGUMENTS, Parameters
-from mptc_gym.presets import IDS
 from mptc_gym.scoring.fit import check_fit
 from mptc_gym.scoring.opening import Plants, opened
 from mptc_gym.scoring.policies import start
@@ -110,7 +109,7 @@ class Evaluation:
 
 def evaluate(
     policy: Any,
-    env: Any = IDS["paper"],
+    env: Any = "MiddlePoint-v0",
     *,
     episodes: int = EPISODES,
     seed: int = SEED,
