@@ -1,4 +1,4 @@
-"""Provide controllers for the middle-point temperature, independent of the environment."""
+"""Controllers for the middle-point temperature of a once-through boiler."""
 
 from agents.controller import Controller
 from agents.dahlin import DahlinController

@@ -11,15 +11,15 @@ Array = NDArray[np.float64]
 def applied_flow(command: Any, dead_zone: Any, u_min: Any, u_max: Any) -> Array:
     """Return the flow u_a that the actuator applies, t/h: equation (29) of the paper.
 
-    A command inside the dead zone gives a flow of 0, and any other command is limited. All
-    arguments broadcast against each other, and the flow has the resulting shape.
+    A command inside the dead zone gives a flow of 0, and other commands are clipped to the flow
+    limits. All arguments broadcast as in NumPy.
 
     Parameters
     ----------
     command
         The command u, t/h.
     dead_zone
-        Half width of the dead zone, t/h. A command on the edge of the dead zone passes.
+        Half width of the dead zone, t/h. A command on the edge of the dead zone gives a flow.
     u_min, u_max
         Lower and upper limit of the flow, t/h.
     """
@@ -27,12 +27,11 @@ def applied_flow(command: Any, dead_zone: Any, u_min: Any, u_max: Any) -> Array:
 
 
 def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
-    """Return the normalised float32 actions for commands: -1 at `u_min` and 1 at `u_max`.
+    """Return the float32 actions for commands: -1 for the command `u_min`, and 1 for `u_max`.
 
-    Rounding to float32 can move a command from the edge of the dead zone to the inside of the
-    dead zone, where a command has no effect. An action that was moved inside by rounding is
-    moved outwards by one float32 step. All arguments broadcast against each other, and the
-    actions have the resulting shape.
+    Rounding to float32 can move a command on the edge of the dead zone into the dead zone,
+    where the command has no effect. An action that rounding moved into the dead zone is moved
+    out again by one float32 step. All arguments broadcast as in NumPy.
 
     Parameters
     ----------
@@ -41,10 +40,10 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     u_min, u_max
         Lower and upper limit of the flow, t/h.
     dead_zone
-        Half width of the dead zone, t/h; 0 to leave all actions as they are rounded.
+        Half width of the dead zone, t/h; 0 to accept any rounding of the actions.
     """
     action = np.asarray(2.0 * (command - u_min) / (u_max - u_min) - 1.0, dtype=np.float32)
-    if np.ndim(dead_zone) == 0 and dead_zone <= 0.0:  # to save the time of the rest
+    if np.ndim(dead_zone) == 0 and dead_zone <= 0.0:  # a shortcut, as there is no dead zone
         return action
     # The command that the plant computes from the action.
     rounded = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
@@ -58,10 +57,10 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 
 
 def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
-    """Return commands none of which lies inside the dead zone, apart from 0.
+    """Return commands that are 0 or outside the dead zone of the actuator.
 
     A command inside the dead zone is moved to the edge of the dead zone or to 0, whichever is
-    nearer. A command outside the dead zone is returned as it is.
+    nearer. A command outside the dead zone is returned unchanged.
 
     Parameters
     ----------

@@ -1,12 +1,12 @@
-"""Identify the delays and time constants of plants by a bank of models.
+"""Identify the delay, time constant and gain of n plants by a bank of candidate models.
 
-All quantities are scaled, so that a bank suits any plant. Flows are divided by half the
-actuator's range. The *authority* is the steady change of temperature that half the actuator's
-range causes in the step test; temperatures are divided by the authority. Times are divided by
-the sampling interval. In scaled quantities, a positive flow raises the temperature.
+All quantities are dimensionless, so that a bank suits any plant. Flows are divided by half the
+flow range, (u_max - u_min) / 2. Temperatures are divided by the steady temperature change that
+half the flow range causes according to the step test. Times are divided by the sampling
+interval. A positive dimensionless flow raises the temperature.
 
-The last axis of every array is the plant: shapes are (n,), (time constants, n) and (delays,
-time constants, n), for n plants.
+The last axis of every array is the plant: arrays have the shape (n,), (time constants, n) or
+(delays, time constants, n), for n plants.
 """
 
 from __future__ import annotations
@@ -21,34 +21,36 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]
 
-# The paper's plant is equation (28), A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k).
-# All models of the bank have the following numbers, but differ in gain, delay, time constant.
+# The paper's plant is equation (28), A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k). All
+# candidate models have the following constants of the paper's plant. The models differ in gain,
+# delay and time constant.
 FAST_POLE: Final = -0.4997  # the faster of the two poles, the roots of the polynomial A
 NEWER_SHARE: Final = 0.9186  # first coefficient of the polynomial B divided by the sum of both
 NOISE_COLOUR: Final = (-0.3574, -0.03392)  # coefficients of the polynomial C from z^-1 on
 
-# Settings of the identification, with which the control error was smallest on random plants.
-# Forgetting factor of the gains, per sample: a gain can drift within 1,000 samples.
+# The following settings gave the smallest control error on random plants. Forgetting factor of
+# the gains, per sample: the gain of a plant can drift within 1,000 samples.
 GAIN_FORGETTING: Final = 0.999
-# Forgetting factor of the models' log-likelihoods, per sample: nearer to 1 than that of the
-# gains, as a delay does not drift.
+# Forgetting factor of the models' log-likelihoods, per sample. The factor is nearer to 1 than
+# `GAIN_FORGETTING`, as the delay of a plant does not drift.
 MODEL_FORGETTING: Final = 0.9995
-# Factor of log-likelihoods. It is below 1, as one-step errors are slightly correlated.
+# Factor of log-likelihoods, below 1 because successive prediction errors are correlated.
 LIKELIHOOD_FACTOR: Final = 0.5
-# Zero of the whitening filter. Nearer to 1, a load disturbs the estimates of gains less.
+# Zero of the whitening filter. With a zero near 1, a load hardly changes the estimated gains.
 LOAD_POLE: Final = 0.98
-# Expected standard deviation of the one-step errors before the first sample, in units of the
-# authority.
+# Expected standard deviation of the models' one-step prediction errors before the first sample,
+# in units of the steady temperature change for half the flow range.
 FIRST_NOISE: Final = 0.07
-FIRST_NOISE_SAMPLES: Final = 30.0  # number of samples that `FIRST_NOISE` counts for
+FIRST_NOISE_SAMPLES: Final = 30.0  # weight of `FIRST_NOISE`, as a number of samples
 LEAST_NOISE_RATE: Final = 0.004  # least weight of the newest error in the noise variance
-# Least standard deviation of the noise, in units of the authority. Smaller errors of the models
-# would come from the low order of the models and not from noise.
+# Least standard deviation of the noise, in units of the steady temperature change for half the
+# flow range. Smaller errors would come from the low order of the models, not from noise.
 LEAST_NOISE: Final = 0.003
-# A squared error is limited to this multiple of the variance, so that an outlier counts little.
+# Largest squared prediction error, as a multiple of the noise variance. Larger squares are
+# clipped, so that an outlier has little influence.
 LARGEST_SQUARE: Final = 16.0
 GAIN_LIMITS: Final = (0.3, 3.0)  # least and greatest gain, as multiples of the step test's
-# Least logarithm of a probability, relative to the most probable model: exp(-30) is nearly 0.
+# Least value of ln(p / q), for a model's probability p and the greatest probability q.
 LEAST_LOGARITHM: Final = -30.0
 # Samples between updates of the models' probabilities, which take the most computing time.
 ESTIMATE_INTERVAL: Final = 2
@@ -57,26 +59,25 @@ LAGS: Final = 4  # number of latest outputs and of latest mean model outputs tha
 
 @dataclass(frozen=True)
 class Prior:
-    """The prior knowledge of n plants: the models of a bank and their probabilities.
+    """Candidate models of n plants, and the prior probabilities of the models.
 
-    Each plant has a model for every pair of a delay and a time constant.
+    Each plant has one candidate model for every pair of a delay and a time constant.
     """
 
     time_constants: ArrayLike
     """Time constants of the models, samples, shape (time constants, n)."""
     shortest_delays: ArrayLike
-    """Shortest delay of each plant's models, samples, as the delay d of equation (28) of the
-    paper, shape (n,). The delays of a plant's models are this delay and 1, 2, ... samples
-    more."""
+    """Shortest delay d of the models of each plant, in samples, as in equation (28) of the
+    paper, shape (n,). The delays of a plant's models are d, d + 1, d + 2 and so on."""
     log_probabilities: ArrayLike
-    """Logarithms of the models' prior probabilities, up to a constant for each plant, shape
-    (delays, time constants, n)."""
+    """Logarithms of the prior probabilities of the models, shape (delays, time constants, n).
+    The probabilities need not sum to 1."""
     gain_spread: ArrayLike
-    """Standard deviation of the plant's gain before the first sample, as a share of the step
-    test's gain, shape (n,)."""
+    """Prior standard deviation of the gain of each plant, divided by the gain that the step
+    test measured, shape (n,)."""
 
     def repeated(self, n: int) -> Prior:
-        """Return the prior knowledge of n equal plants; `self` must be that of one plant."""
+        """Return this prior for n equal plants; `self` must be the prior of one plant."""
         repeated = {name: np.repeat(values, n, axis=-1) for name, values in vars(self).items()}
         return Prior(**repeated)
 
@@ -84,9 +85,9 @@ class Prior:
 def model_coefficients(time_constants: Array) -> tuple[Array, Array, Array, Array]:
     """Return a1, a2, b1 and b2 of s(k) = a1 s(k-1) + a2 s(k-2) + b1 f(k-1) + b2 f(k-2).
 
-    The equation is a model with the flow f as its input, the output s, a gain of 1 and no
-    delay. The model's fast pole, and the ratio b1 / b2, are those of equation (28) of the
-    paper. `time_constants` are in samples, and the four arrays have the same shape.
+    The equation for s(k) is a plant model with the flow f as the input, the output s, a gain of
+    1 and no delay. The fast pole and the ratio b1 / b2 are taken from equation (28) of the
+    paper. `time_constants` are in samples, and each result has the shape of `time_constants`.
     """
     pole = np.exp(-1.0 / time_constants)
     sum_of_b = (1.0 - pole) * (1.0 - FAST_POLE)
@@ -97,26 +98,24 @@ def model_coefficients(time_constants: Array) -> tuple[Array, Array, Array, Arra
 class UndelayedModels:
     """Models of n plants with a gain of 1 and no delay, one model for each time constant.
 
-    The docstring of `model_coefficients` states the equation of the models. The models start at
-    rest.
-
-    The models run in NumPy, or in PyTorch so that gradients can pass through the models.
+    The function `model_coefficients` states the equation of a model. All models start with the
+    output 0.
 
     Parameters
     ----------
     time_constants
         Time constants of the models, samples, shape (time constants, n).
     convert
-        Function that converts a NumPy array to an array of the library in which the models run.
+        Function that converts a NumPy array: `torch.from_numpy` to compute in PyTorch.
 
     Attributes
     ----------
     outputs
-        Outputs s(k) of the models at the present sample, shape (time constants, n).
+        Outputs s(k) of the models at the present sample k, shape (time constants, n).
     last_outputs
-        Outputs s(k-1) of the models at the last sample, shape (time constants, n).
+        Outputs s(k-1) of the models at the previous sample, shape (time constants, n).
     last_flow
-        The flow f(k-1) of the last sample, in units of half the actuator's range, shape (n,).
+        Flow f(k-1) at the previous sample, as a share of half the flow range, shape (n,).
     """
 
     def __init__(
@@ -128,7 +127,7 @@ class UndelayedModels:
         self.last_flow = convert(np.zeros_like(time_constants[0]))
 
     def advance(self, flow: Any) -> None:
-        """Advance the models by a sample with the flow f(k), shape (n,)."""
+        """Compute the outputs of the next sample for the present flow f(k), shape (n,)."""
         a1, a2, b1, b2 = self._coefficients
         next_outputs = a1 * self.outputs + a2 * self.last_outputs
         next_outputs = next_outputs + b1 * flow + b2 * self.last_flow
@@ -138,25 +137,24 @@ class UndelayedModels:
 
 
 class Whitening:
-    """The filter (1 - FAST_POLE/z) (1 - LOAD_POLE/z) / C(1/z), which makes noise nearly white.
+    """The filter (1 - FAST_POLE/z) (1 - LOAD_POLE/z) / C(1/z), which whitens the plant's noise.
 
-    The plant's noise is C xi / A, with the polynomials A and C and the white noise xi of
-    equation (28) of the paper.
+    In equation (28) of the paper, the noise of the plant is C xi / A, with polynomials A and C
+    and white noise xi.
 
     Parameters
     ----------
     shape
-        Shape of a sample of the signal. The filter treats every element separately, and starts
-        at rest.
+        Shape of one sample of the signal. Each element of a sample is filtered separately.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         rest = np.zeros(shape, np.float32)
-        self._inputs = deque([rest, rest], maxlen=2)  # newest first, as the outputs
+        self._inputs = deque([rest, rest], maxlen=2)  # newest first
         self._outputs = deque([rest, rest], maxlen=2)
 
     def __call__(self, signal: Array) -> Array:
-        """Return the next sample of the filtered signal, for the next sample of the signal."""
+        """Return the filtered value of the next sample of the signal."""
         # The numerator is 1 - (FAST_POLE + LOAD_POLE) / z + FAST_POLE LOAD_POLE / z^2.
         output: Array = signal - (FAST_POLE + LOAD_POLE) * self._inputs[0]
         output = output + FAST_POLE * LOAD_POLE * self._inputs[1]
@@ -168,53 +166,56 @@ class Whitening:
 
 
 class Bank:
-    """Models of n plants, y(k) = g s(k - d), one for each pair of a delay and time constant.
+    """Candidate models y(k) = g s(k - d) of n plants, with their gains and probabilities.
 
-    Here y is the output, d the delay in samples, and s the output of a model with gain 1 and no
-    delay for the flows so far. The gain g of each model is estimated by recursive least squares
-    on whitened signals, with the step test's gain as a prior. The probability of a model
-    follows from its one-step errors, which are taken for Gaussian. Gains and probabilities
-    forget old samples exponentially, but they never forget the prior.
+    Each model predicts the output y(k) = g s(k - d), with the gain g, the delay d in samples,
+    and the output s(k) of a model with gain 1 and no delay. Each plant has one candidate model
+    for every pair of a delay and a time constant.
 
-    At each sample, call `observe` with the output, read the attributes, choose a flow, and call
-    `apply` with the flow.
+    The gain g of each model is estimated by recursive least squares on whitened signals, and
+    its prior mean is the gain of the step test. The probability of each model follows from its
+    one-step prediction errors, which are assumed to be Gaussian. Old samples lose their weight
+    exponentially in the estimated gains and probabilities, but the prior does not.
+
+    At each sample, call `observe` with the measured output, and then `apply` with the flow.
 
     Parameters
     ----------
     prior
-        The models, and what is known of the plants before the first sample.
+        Candidate models and their prior probabilities.
 
     Attributes
     ----------
     n : int
-        The number of plants.
+        Number of plants.
     time_constants, gain_spread : ndarray
         The fields of `prior`, as arrays of float32.
     shares : ndarray
-        Probabilities of the time constants, shape (time constants, n).
+        Probabilities of the candidate time constants, shape (time constants, n).
     delay, delay_spread : ndarray
-        Mean and standard deviation of the delay, samples, as the delay d of equation (28) of
+        Estimated mean and standard deviation of the delay d, samples, as in equation (28) of
         the paper, shape (n,).
     log_constant, log_constant_spread : ndarray
-        Mean and standard deviation of the natural logarithm of the time constant in samples,
+        Estimated mean and standard deviation of ln(T), for the time constant T in samples,
         shape (n,).
     pole : ndarray
-        Mean of exp(-1 / T), the pole of a model with the time constant T in samples, shape
-        (n,).
+        Estimated mean of the pole exp(-1 / T), for the time constant T in samples, shape (n,).
     fading : ndarray
-        Mean of exp(-(d + 1) / T), shape (n,): the share of a deviation that remains after d + 1
-        samples, when the present flow shows in the output, if the deviation decays with the
-        time constant T in samples.
+        Estimated mean of exp(-(d + 1) / T), for the delay d and the time constant T in samples,
+        shape (n,). This share of a deviation with the time constant T remains after d + 1
+        samples.
     variance : ndarray
-        Variance of the one-step errors, in units of the authority squared, shape (n,).
+        Estimated variance of the models' one-step prediction errors, in squared units of the
+        steady temperature change for half the flow range, shape (n,).
     innovation : ndarray
-        The newest one-step error of the whitened output, mean over the models, in units of the
-        authority, shape (n,).
+        Newest one-step prediction error of the whitened output, as a mean over the models, in
+        units of the steady temperature change for half the flow range, shape (n,).
     outputs : ndarray
-        The latest outputs y(k), y(k-1), ..., in units of the authority, shape (LAGS, n).
+        Measured outputs y(k), y(k-1) and so on, newest first, in units of the steady
+        temperature change for half the flow range, shape (LAGS, n).
     responses : ndarray
-        The mean of s(k - d) over the models, then the means of s(k - d - 1), ..., shape
-        (LAGS, n).
+        Delayed outputs s(k - d), s(k - d - 1) and so on of models with gain 1, as means that
+        are weighted by the probabilities of the models, shape (LAGS, n).
     """
 
     def __init__(self, prior: Prior) -> None:
@@ -231,18 +232,19 @@ class Bank:
         self._undelayed = UndelayedModels(self.time_constants)
         self._whiten_output = Whitening((self.n,))
         self._whiten_response = Whitening((constant_count, self.n))
-        # Past outputs s of the models without delay, and the whitened s, as two elements of the
-        # second axis. The first axis is a ring: sample k has the row k modulo the length.
+        # Ring buffer of the outputs of the models without delay: sample k is in row k modulo
+        # the length. On the second axis, element 0 is the output and element 1 the whitened
+        # output.
         ring_shape = (int(self._shortest_delays.max()) + 1, 2, constant_count, self.n)
         self._ring = np.zeros(ring_shape, np.float32)
-        # Outputs s(k - d) for the shortest delay d, and then for longer delays.
+        # Delayed outputs s(k - d), in order of the delay d, from the shortest delay on.
         delayed_shape = (self._delay_count + LAGS - 1, constant_count, self.n)
         self._delayed = np.zeros(delayed_shape, np.float32)
         # The whitened s(k - d) of each model.
         self._regressors = np.zeros_like(self._log_priors)
         self.outputs = np.zeros((LAGS, self.n), np.float32)
-        # Sums over past samples, which forget exponentially: squared regressors, regressors
-        # times whitened outputs, and log-likelihoods.
+        # Exponentially weighted sums over past samples: squared regressors, regressors times
+        # whitened outputs, and log-likelihoods.
         self._information = np.zeros_like(self._log_priors)
         self._products = np.zeros_like(self._log_priors)
         self._log_likelihoods = np.zeros_like(self._log_priors)
@@ -251,14 +253,19 @@ class Bank:
         self._renew_estimates()
 
     def observe(self, output: Array) -> None:
-        """Update the models with the newest output y(k), in units of the authority, (n,)."""
+        """Update the gains and probabilities of the models with the measured output y(k).
+
+        `output` is in units of the steady temperature change for half the flow range, shape
+        (n,).
+        """
         self.outputs[1:] = self.outputs[:-1]
         self.outputs[0] = output
-        # What a model has now, the model with the next longer delay has at the next sample.
+        # Shift by one sample: the model with the next longer delay has the same output one
+        # sample later.
         self._delayed[1:] = self._delayed[:-1]
         self._regressors[1:] = self._regressors[:-1]
         rows = (self._k - self._shortest_delays) % len(self._ring)
-        # The index selects a row for each plant, and puts the axis of the plants first.
+        # The index selects a row for each plant. The result has the plants as its first axis.
         newest = self._ring[rows, :, :, np.arange(self.n)].transpose(1, 2, 0)
         self._delayed[0], self._regressors[0] = newest
         self._learn(self._whiten_output(self.outputs[0].copy()))
@@ -272,10 +279,10 @@ class Bank:
         self.responses = np.stack(means)
 
     def apply(self, flow: Array) -> None:
-        """Update the models with the flow f(k) that the actuator passes.
+        """Update the models with the flow f(k) that leaves the actuator.
 
-        `flow` is in units of half the actuator's range, shape (n,). At each sample, call this
-        method after `observe`.
+        `flow` is a share of half the flow range, shape (n,). At each sample, call `observe`
+        before `apply`.
         """
         self._undelayed.advance(flow)
         response = self._undelayed.outputs
@@ -284,17 +291,18 @@ class Bank:
         self._ring[row, 1] = self._whiten_response(response)
 
     def _learn(self, whitened: Array) -> None:
-        """Update the sums for the gains, the noise variance and the models' log-likelihoods.
+        """Update the sums for the models' gains and probabilities, and the noise variance.
 
-        `whitened` is the newest output after the whitening filter, in units of the authority,
-        shape (n,).
+        `whitened` is the newest measured output after the whitening filter, shape (n,), in
+        units of the steady temperature change for half the flow range.
         """
         errors = whitened - self._gains * self._regressors
         self.innovation = np.einsum("dtn,dtn->n", self._weights, errors)
         squares = np.square(errors)
         self._log_likelihoods *= MODEL_FORGETTING
         self._log_likelihoods -= squares * (0.5 * LIKELIHOOD_FACTOR / self.variance)
-        # The noise variance is at first the mean of all squared errors so far.
+        # At the start of an episode, the noise variance is the mean of all squared errors so
+        # far.
         rate = max(LEAST_NOISE_RATE, 1.0 / (FIRST_NOISE_SAMPLES + self._k))
         square = np.einsum("dtn,dtn->n", self._weights, squares)
         square = np.minimum(square, LARGEST_SQUARE * self.variance)
@@ -306,8 +314,8 @@ class Bank:
         self._products += self._regressors * whitened
 
     def _renew_estimates(self) -> None:
-        """Compute the models' gains and probabilities, and the means over the models."""
-        # The step test's gain, which is 1, counts like samples with this information.
+        """Update the gains and probabilities of the models, and all weighted means."""
+        # Weight of the prior gain, which is 1, in the least squares estimate of the gain.
         of_prior = self.variance / np.square(self.gain_spread)
         gains = (self._products + of_prior) / (self._information + of_prior)
         self._gains = np.clip(gains, *GAIN_LIMITS)
@@ -324,10 +332,10 @@ class Bank:
 
 
 def _moments(weights: Array, values: Array) -> tuple[Array, Array]:
-    """Return the weighted mean and standard deviation of `values` over the first axis.
+    """Return the weighted mean and standard deviation of `values`, each of shape (n,).
 
-    `weights` are probabilities, whose sum over the first axis is 1. Both arguments have the
-    shape (count, n), and both results the shape (n,).
+    `weights` and `values` have the shape (count, n). For each of the n columns, the weights sum
+    to 1.
     """
     mean = (weights * values).sum(0)
     variance = (weights * np.square(values - mean)).sum(0)

@@ -1,4 +1,4 @@
-"""Define the base classes of all controllers, and check their arguments."""
+"""Define the base classes of all controllers, and validate constructor arguments."""
 
 from __future__ import annotations
 
@@ -15,35 +15,33 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.actuator import float32_action
 
-# Arguments of the environment that show the six inputs of the paper's network: the latest three
-# set points and the latest three errors.
+# Arguments of the environment for an observation of the latest three set points and the latest
+# three errors: the six inputs of the paper's network.
 PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
-# Largest number of nodes, loops or samples of delay that is accepted. A larger number is a
-# typing error, and could exhaust the memory.
+# Largest allowed number of network nodes, of loops and of samples of delay. A larger number is
+# probably a typing error, and could exhaust the memory.
 LARGEST_SIZE = 1_000_000
 
 Validator = Callable[[str, Any], Any]
 
 
 def _require(is_allowed: bool, name: str, value: Any, allowed: str) -> None:
-    """Raise a ValueError unless `is_allowed`: the argument `name` must be `allowed`.
+    """Raise a ValueError for the argument `name` unless `is_allowed` is true.
 
-    `allowed` describes the allowed values in words, such as "a finite number", and the message
-    shows the argument's `value`.
+    `allowed` describes the allowed values in words for the message, such as "a finite number".
     """
     if not is_allowed:
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
 
 
 def _is_number(value: Any, kind: type[Any]) -> bool:
-    """Return whether a value is a number of a kind, `Real` or `Integral`, but not a bool."""
+    """Return whether a value is an instance of `kind`, `Real` or `Integral`, but not a bool."""
     return isinstance(value, kind) and not isinstance(value, bool | np.bool_)
 
 
-# The following functions validate an argument: `name` is the argument's name, for the message.
-# An allowed value is returned as a Python float, int or bool. For any other value, the function
-# raises a ValueError that names the argument.
+# Each of the following functions validates a constructor argument. `name` is the argument's
+# name for the message of the ValueError.
 
 
 def finite(name: str, value: Any) -> float:
@@ -101,8 +99,8 @@ def array_size(name: str, value: Any) -> int:
     return int(value)
 
 
-# Types for the fields of controllers. Each type carries one of the validators above, which the
-# controller's constructor calls.
+# Types for the fields of controllers. Each type carries a validator, which the constructor of
+# the controller calls with the field's value.
 Number = Annotated[float, finite]
 NotNegative = Annotated[float, not_negative]
 Positive = Annotated[float, positive]
@@ -116,8 +114,8 @@ Size = Annotated[int, array_size]
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
     """Return real numbers as a float64 array of the same shape.
 
-    `name` is the argument's name for the message of the ValueError, which is raised if `value`
-    is not an array-like of real numbers: text, complex numbers or rows of unequal length.
+    A ValueError that names the argument `name` is raised for anything else, such as text,
+    complex numbers or rows of unequal length.
     """
     try:
         array = np.asarray(value)
@@ -128,9 +126,9 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
     raise ValueError(f"{name} must be numbers, got {value!r}")
 
 
-@cache  # as reading the annotations is slow
+@cache  # because `get_type_hints` is slow
 def _validators(controller_class: type) -> dict[str, Validator]:
-    """Return the validators of a controller class by the names of the fields."""
+    """Return a dict from field names of a controller class to their validators."""
     annotations = get_type_hints(controller_class, include_extras=True)
     validators = {}
     for name, annotation in annotations.items():
@@ -143,29 +141,29 @@ def _validators(controller_class: type) -> dict[str, Validator]:
 class Controller(ABC):
     """A controller of one control loop, or of a batch of independent control loops.
 
-    Controllers are dataclasses: the fields of a controller are the arguments of its
-    constructor, and the type of a field, such as `Positive`, states which values are allowed.
+    Every controller is a dataclass whose fields are the constructor arguments. The type of a
+    field, such as `Positive`, states the allowed values.
 
     Parameters
     ----------
     u_min
-        Lower limit of the actuator, t/h: the flow for which the action -1 stands. Commands
-        beyond the limits of the actuator are not clipped by the controller.
+        Lower limit of the actuator's flow, t/h, which the action -1 commands. The controller
+        does not clip commands to the limits.
     u_max
-        Upper limit of the actuator, t/h: the flow for which the action 1 stands.
+        Upper limit of the actuator's flow, t/h, which the action 1 commands.
 
     Attributes
     ----------
     n_obs : int
-        The minimum number of elements in an observation of one loop.
+        Smallest number of elements that an observation of one loop may have.
     command : float64 or ndarray of float64
-        The last command u, t/h: the flow that the controller asked of the actuator. After `act`
-        on a batch of loops, the shape is (batch,).
+        Command u of the last call of `act`, t/h: a number, or an array of shape (batch,) for a
+        batch of loops.
 
     Raises
     ------
     ValueError
-        If an argument is out of range; the message names the argument.
+        If a constructor argument is out of range. The message names the argument.
     """
 
     u_min: Number = -10.0
@@ -173,18 +171,19 @@ class Controller(ABC):
     n_obs: int = field(init=False, repr=False)
     command: Values = field(init=False, repr=False)
 
-    # Half width of the dead zone, t/h, if the controller commands the edge of the dead zone: an
-    # action for the edge is rounded such that the flow passes. Otherwise 0.
+    # Half width of the dead zone, t/h, for a controller that commands the edge of the dead
+    # zone, and 0 for other controllers. `float32_action` keeps such commands out of the dead
+    # zone.
     _edge = 0.0
-    # Whether the controller remembers past samples. Without memory, the batch size may change
-    # at any sample.
+    # Whether the controller remembers past samples. The batch size of a controller without
+    # memory may change at any sample.
     _remembers = True
 
     def __post_init__(self) -> None:
-        """Check the constructor's arguments, and call `reset`.
+        """Validate the constructor arguments, and call `reset`.
 
-        A subclass calls this method first, and then sets the attributes that its `reset` does
-        not use.
+        A subclass must call `super().__post_init__()` first. The method `reset` must not use
+        attributes that a subclass sets after this call.
         """
         for name, validator in _validators(type(self)).items():
             setattr(self, name, validator(name, getattr(self, name)))
@@ -193,94 +192,97 @@ class Controller(ABC):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past samples before a new episode, but keep learnt weights."""
+        """Forget past samples before a new episode, but keep learnt network weights."""
         self.command = np.float64(0.0)
-        # Shape of the commands since `reset`: () for one loop, (batch,) for a batch, and None
-        # before the first sample.
+        # Shape of the commands since `reset`: () for one loop, (batch,) for a batch of loops,
+        # and None before the first sample.
         self._loop_shape: tuple[int, ...] | None = None
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
-        """Refuse plants that the controller was not made for, as their scores would be wrong.
+        """Raise a ValueError if the controller does not fit the plants of an environment.
 
-        `mptc_gym.evaluate` calls this method before it runs the controller.
+        `mptc_gym.evaluate` calls this method before an evaluation, so that a wrong limit or
+        observation does not give a wrong score.
 
         Parameters
         ----------
         parameters
-            The arguments of the plants, as attributes with the names of `mptc_gym.Parameters`;
-            an argument that differs between plants is an array of shape (n,).
+            Parameter values of the plants, as attributes named as in `mptc_gym.Parameters`. A
+            value that differs between the plants is an array of shape (n,).
         wrapped
-            The names of the environment's wrappers that change observations or actions; ""
-            without such wrappers.
+            Names of the environment's wrappers that change observations or actions, or "".
         n
-            Number of plants, each of which is one loop.
+            Number of plants.
 
         Raises
         ------
         ValueError
-            If the limits of the flow differ, if the controller would read a set point or an
-            error at the wrong place of the observation, if the environment is wrapped, or if
-            the controller has weights for another number of loops.
+            If the controller does not fit the flow limits, the observations or the number of
+            the plants, or if `wrapped` is not empty.
         """
-        # If each episode draws its limits of the flow, the controller must have the widest.
+        # If the flow limits are random for each episode, the controller must have the widest
+        # limits.
         limits = float(np.min(parameters.u_min)), float(np.max(parameters.u_max))
         if limits != (self.u_min, self.u_max):
             raise ValueError(
-                f"policy must be made with the limits of env, u_min={limits[0]}, "
+                f"policy must have the flow limits of env, u_min={limits[0]}, "
                 f"u_max={limits[1]}, got {self.u_min}, {self.u_max}"
             )
         first = 0  # index of the signal's newest sample in the observation
         for signal in ("setpoint", "error"):
             window = getattr(parameters, f"{signal}_window")
-            # None if the controller does not read this element alone.
+            # None for a controller without an index for this signal.
             index = getattr(self, f"{signal}_index", None)
             if index is not None and (index != first or not window):
                 raise ValueError(
-                    f"env must show its newest {signal} as element {index} of the observation, "
-                    f"where policy reads it, got setpoint_window={parameters.setpoint_window}, "
+                    f"env must have the newest {signal} as element {index} of an observation, "
+                    f"because policy reads this element, got "
+                    f"setpoint_window={parameters.setpoint_window}, "
                     f"error_window={parameters.error_window}"
                 )
             first += window
         if wrapped:
             raise ValueError(
-                f"env must not be wrapped, as policy commands the flow itself, got {wrapped}"
+                f"env must not be wrapped in a wrapper that changes observations or actions, "
+                f"got {wrapped}"
             )
 
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """Return the action of the present sample; call this method once for each sample.
+        """Return the action for an observation; call this method once per sample.
 
         Parameters
         ----------
         observation
-            The environment's observation, of shape (n_obs,) for one loop, or (batch, n_obs)
-            with one row per loop. Elements that the controller does not read are ignored.
+            Observation of shape (n_obs,) for one loop, or (batch, n_obs) for a batch of loops.
+            Elements that the controller does not need are ignored.
 
         Returns
         -------
         ndarray of float32
-            The normalised action: -1 stands for `u_min`, and 1 for `u_max`. The shape is (1,)
-            for one loop, or (batch, 1). An action lies outside [-1, 1] if the command exceeds
-            the actuator's limits.
+            Normalised action, -1 for the command `u_min` and 1 for `u_max`, of shape (1,) for
+            one loop, or (batch, 1). A command beyond the actuator's limits gives an action
+            outside [-1, 1].
 
         Raises
         ------
         ValueError
-            If the observation has the wrong shape, a value that is not finite, or another batch
-            size than the observations since `reset`. The error leaves the controller unchanged.
+            If `observation` has a wrong shape, a value that is not finite, or another batch
+            size than earlier observations since `reset`. A ValueError leaves the controller
+            unchanged.
         """
         values = check_numbers("observation", observation)
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs or not len(values):
             raise ValueError(
-                f"observation must have shape (n_obs,) or (batch, n_obs), n_obs at least "
-                f"{self.n_obs}, got {values.shape}"
+                f"observation must have shape (n_obs,) or (batch, n_obs), with n_obs of at "
+                f"least {self.n_obs}, got {values.shape}"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")
         loop_shape = values.shape[:-1]
         if self._loop_shape not in (None, loop_shape):
             raise ValueError(
-                f"observation must have shape {(*self._loop_shape, self.n_obs)}, for the "
-                f"loops since reset or for num_envs loops, got {values.shape}"
+                f"observation must have shape {(*self._loop_shape, self.n_obs)}, as the "
+                f"number of loops is fixed by num_envs or since reset, got {values.shape}"
             )
         commands = self._control(np.atleast_2d(values))
         is_batch = loop_shape != ()
@@ -293,17 +295,15 @@ class Controller(ABC):
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the commands u(k), t/h, shape (loops,), and update the controller's memory.
 
-        `act` calls this method once per sample. `rows` are the checked observations, with one
-        row per loop, shape (loops, size).
+        `rows` are the observations of all loops at one sample, shape (loops, elements).
         """
 
 
 @dataclass(eq=False, kw_only=True)
 class ModelBasedController(Controller):
-    """A controller that knows a step test of the plant, and the numbers of the actuator.
+    """A controller whose arguments include a first-order model of the plant, from a step test.
 
-    The step test gives the gain, the time constant and the delay of a first-order model. The
-    arguments `u_min` and `u_max` are those of `Controller`.
+    The arguments `u_min` and `u_max` are described in `Controller`.
 
     Parameters
     ----------
@@ -312,11 +312,11 @@ class ModelBasedController(Controller):
     time_constant
         Time constant of the plant, s.
     delay
-        Delay of the plant, s, from a change of the command to the first change of a sampled
-        output: d + 1 sampling intervals for a transport delay of d samples.
+        Delay of the plant, s, from a change of the command to the first sampled output that
+        changes. A transport delay of d samples gives a `delay` of d + 1 sampling intervals.
     dead_zone
-        Half width of the actuator's dead zone, t/h; 0 if unknown. A command inside the dead
-        zone reaches the plant as a flow of 0; a command on the edge of the dead zone passes.
+        Half width of the actuator's dead zone, t/h; 0 if unknown. A command smaller in size
+        than `dead_zone` gives a flow of 0.
     sampling_interval
         Sampling interval, s.
     """

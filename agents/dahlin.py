@@ -1,4 +1,4 @@
-"""Implement Dahlin's controller: the closed loop follows set points like a first-order lag."""
+"""Implement Dahlin's controller, whose closed loop responds like a first-order lag."""
 
 from __future__ import annotations
 
@@ -17,39 +17,41 @@ Array = NDArray[np.float64]
 
 @dataclass(eq=False, kw_only=True)
 class DahlinController(InternalModelController):
-    """A controller that makes the output approach the set point like a first-order lag.
+    """A controller with which the output approaches the set point like a first-order lag.
 
-    The controller is that of Dahlin, "Designing and tuning digital controllers", Instruments
-    and Control Systems 41 (6), 1968, 77-83, written as internal model control (Morari and
-    Zafiriou, "Robust Process Control", 1989, chapter 3). With the sampling interval h, the
-    factors below are g = 1 - exp(-h / lambda) and f = 1 - exp(-h / T_f).
+    Dahlin's control law was published in "Designing and tuning digital controllers",
+    Instruments and Control Systems 41 (6), 1968, 77-83. This class implements Dahlin's control
+    law as internal model control (Morari and Zafiriou, "Robust Process Control", 1989, chapter
+    3). With the sampling interval h, the control law has the factors g = 1 - exp(-h / lambda)
+    and f = 1 - exp(-h / T_f).
 
     - A first-order model, x(k+1) = p x(k) + b u_a(k), runs in parallel with the plant, where
-      u_a is the flow that the actuator passes. With the delay of d samples, the model predicts
-      that the plant's output y(k) is x(k-d).
-    - The estimated disturbance D(k), degC, is the measured output minus the model's output,
-      after a low-pass filter: D(k) = D(k-1) + f (y(k) - x(k-d) - D(k-1)).
-    - The command u(k) moves the model's state x a share g of its way to y_d - D, the set point
-      minus the disturbance: u(k) = ((1 - p) x(k) + g (y_d(k) - D(k) - x(k))) / b.
+      u_a is the flow that leaves the actuator. For a delay of d samples, the prediction of the
+      plant's output y(k) is x(k-d).
+    - The estimated disturbance D(k), degC, is the low-pass filtered difference between the
+      measured output and the model's delayed output: D(k) = D(k-1) + f (y(k) - x(k-d) -
+      D(k-1)).
+    - The command u(k) moves the model's state x by a share g of the distance to the set point
+      minus the disturbance, y_d - D: u(k) = ((1 - p) x(k) + g (y_d(k) - D(k) - x(k))) / b.
 
     A command inside the dead zone is moved to 0 or to the edge of the dead zone, whichever is
-    nearer. The controller needs no anti-windup: it has no integral, and the model's input is
-    the flow u_a that the actuator passes.
+    nearer. The controller needs no anti-windup, because the controller has no integral, and
+    because the model's input is the flow u_a that leaves the actuator.
 
-    The other parameters are those of `ModelBasedController`.
+    All other parameters are described in `ModelBasedController`.
 
     Parameters
     ----------
     closed_loop_time_constant
-        lambda, time constant of the response to a step of the set point, s. With a large
-        lambda, the commands for small errors stay inside the dead zone and have no effect.
-        Errors up to 0.5 |gain| dead_zone lambda / time_constant, degC, are then not corrected.
+        lambda, the time constant of the response to a step of the set point, s. Errors up to
+        0.5 |gain| dead_zone lambda / time_constant, degC, are not corrected, because a command
+        inside the dead zone has no effect.
     filter_time_constant
-        T_f, time constant of the low-pass filter of the disturbance, s; 0 for no filter, as in
-        Dahlin's paper. A larger T_f makes the loop more robust, and does not change the
-        response to the set point if the model is right.
+        T_f, the time constant of the low-pass filter of the estimated disturbance, s; 0 for no
+        filter, as in Dahlin's paper. A larger T_f makes the closed loop more robust. T_f has no
+        effect on the response to the set point if the model equals the plant.
     setpoint_index, error_index
-        Indices of the set point y_d(k) and of the error e(k), both in degC, in the observation.
+        Indices of the set point y_d(k) and the error e(k), both in degC, in an observation.
     """
 
     closed_loop_time_constant: Positive
@@ -68,18 +70,18 @@ class DahlinController(InternalModelController):
     def reset(self) -> None:
         """Set the model's output and the estimated disturbance to 0, before a new episode."""
         super().reset()
-        self._disturbance: Values = np.float64(0.0)  # D, degC
+        self._disturbance: Values = np.float64(0.0)  # estimated disturbance D, degC
 
     def transfer(self) -> tuple[Array, Array]:
         """Return the transfer function from -y to the command u, t/h per degC.
 
-        The set point is 0, so the error is -y, the negative output. The controller is linear
-        while the command is between the limits of the flow and outside the dead zone.
+        For the set point 0, the error is -y, the negative output. The transfer function is
+        valid while the command is within the flow limits and outside the dead zone.
 
         Returns
         -------
         numerator, denominator
-            Coefficients of z^0, z^-1 and so on.
+            Coefficients of z^0, z^-1, z^-2 and so on, as arrays.
         """
         share = self._approach * self._filter
         numerator = share * np.array([1.0, -self._pole])
@@ -89,10 +91,7 @@ class DahlinController(InternalModelController):
         return numerator, self._input_gain * polysub(smoothed, in_transit)
 
     def _control(self, rows: Array) -> Array:
-        """Return the commands u(k), t/h, shape (loops,), and advance the model by a sample.
-
-        `rows` are the observations, shape (loops, size).
-        """
+        """Return the commands u(k), t/h, shape (loops,), and update the model's state."""
         setpoint = rows[:, self.setpoint_index]
         output = setpoint - rows[:, self.error_index]
         residual = output - self._delayed

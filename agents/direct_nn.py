@@ -1,4 +1,4 @@
-"""Implement the paper's neural controller, which learns online from the control error."""
+"""Implement the paper's neural network controller, which learns from the control error."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)  # arrays have no single truth value
 class Weights:
-    """Weights and thresholds of one network, or of a batch of networks.
+    """Weights and thresholds of one neural network, or of a batch of neural networks.
 
-    A network has N inputs, N_1 hidden nodes and one output. The arrays of a batch have a
-    leading batch axis in addition to the shapes below.
+    A network has N inputs, N_1 hidden nodes and one output. In a batch of networks, every array
+    has an additional first axis, whose length is the number of networks.
     """
 
     W: Array
@@ -42,14 +42,14 @@ class Weights:
     """Threshold theta_21 of the output; shape ()."""
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the weights to the `.npz` file `path`, which `load` reads."""
+        """Write the weights to the `.npz` file `path`."""
         write_arrays(path, **vars(self))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Weights:
-        """Return the weights in a file that was written by `save`.
+        """Return the weights in an `.npz` file that the method `save` has written.
 
-        A ValueError is raised if the file is damaged or holds something else.
+        A ValueError is raised if the file is damaged or has other contents than weights.
         """
         with open_arrays(path, "weights") as file:
             arrays = {field.name: file[field.name] for field in fields(cls)}
@@ -58,53 +58,54 @@ class Weights:
 
 @dataclass(eq=False, kw_only=True)
 class DirectNNController(Controller):
-    """A network of N inputs, N_1 hidden nodes and one output that learns while it controls.
+    """The paper's controller: a neural network with one hidden layer that learns online.
 
-    At each sample k, the controller takes steps A to E of Section 4 of the paper: the command
-    is computed with the present weights, and then the weights are updated from the error e(k)
-    and the activations of the nodes. The controller knows only one thing about the plant: D(G),
-    the direction in which the output moves when the input rises.
+    At each sample k, steps A to E of Section 4 of the paper compute the command with the
+    present weights, and then update the weights from the error e(k) and the activations of the
+    nodes. The only prior knowledge of the plant is D(G), the direction in which the plant's
+    output moves when the flow rises.
 
     Parameters
     ----------
     u_min
-        U_min, the lowest command, t/h: an output of 0 of the network.
+        U_min, the lowest command, t/h, for a network output of 0.
     u_max
-        U_max, the highest command, t/h: an output of 1 of the network.
+        U_max, the highest command, t/h, for a network output of 1.
     n_inputs
-        N, number of inputs, which are the first N elements of the observation.
+        N, the number of inputs of the network. The inputs are the first N elements of an
+        observation, times `input_scale`.
     n_hidden
-        N_1, number of hidden nodes.
+        N_1, the number of hidden nodes.
     eta
-        eta^y, learning rate of W, the weights from the inputs to the hidden nodes.
+        eta^y, the learning rate of W, the weights from the inputs to the hidden nodes.
     eta_1
-        eta_1^y, learning rate of W_1, the weights from the hidden nodes to the output.
+        eta_1^y, the learning rate of W_1, the weights from the hidden nodes to the output.
     eta_theta
-        eta_theta^y, learning rate of theta_1, the thresholds of the hidden nodes.
+        eta_theta^y, the learning rate of theta_1, the thresholds of the hidden nodes.
     eta_1_theta
-        eta_1theta^y, learning rate of theta_2, the threshold of the output.
+        eta_1theta^y, the learning rate of theta_2, the threshold of the output node.
     direction
-        D(G): -1 for a plant whose output falls when its input rises, 1 for a plant whose output
-        rises with its input.
+        D(G): -1 for a plant whose output falls when the flow rises, and 1 for a plant whose
+        output rises with the flow.
     input_scale
-        Factor from elements of the observation, degC, to the inputs X_i of the network. The
-        paper does not state this factor.
+        Factor, per degC, that converts elements of an observation to the inputs X_i of the
+        network. The paper does not state the factor of the inputs.
     weight_scale
-        Initial weights and thresholds are random numbers, uniformly distributed in
-        [-weight_scale, weight_scale]. The paper only says "selected randomly".
+        Largest size of an initial weight or threshold. Initial weights and thresholds are
+        uniformly distributed in [-weight_scale, weight_scale]; the paper only calls them
+        "selected randomly".
     error_index
-        Index of the error e(k), degC, in the observation.
+        Index of the error e(k), degC, in an observation.
     seed
-        Seed of the initial weights.
+        Seed of the random initial weights.
     num_envs
-        Number of loops in a batch, each with its own network; None for a single loop. The
-        network of loop i equals that of a single controller with the seed `seed + i`, bit for
-        bit.
+        Number of control loops in a batch, with one network per loop; None for a single loop.
+        Loop i of a batch behaves bit for bit like a single loop with the seed `seed + i`.
     learning
-        Whether the weights are updated; this attribute can be changed at any time.
+        Whether the weights are updated. The attribute `learning` can be changed at any time.
     update_interval
-        The weights are updated at every `update_interval`-th sample, starting with the first
-        sample of an episode.
+        Number of samples from one update of the weights to the next. The first update is at the
+        first sample of an episode.
 
     Examples
     --------
@@ -119,7 +120,8 @@ class DirectNNController(Controller):
 
     n_inputs: Size = 6
     n_hidden: Size = 3
-    # The learning rates and scales are those of the search `benchmarks.tune nn` in version 0.1.
+    # The random search `benchmarks.tune nn` of version 0.1 found these learning rates and
+    # scales.
     eta: NotNegative = 5.3
     eta_1: NotNegative = 0.0303
     eta_theta: NotNegative = 0.0462
@@ -150,7 +152,7 @@ class DirectNNController(Controller):
         self.weights = self._initial_weights()
 
     def _initial_weights(self) -> Weights:
-        """Return random initial weights; network i of a batch uses the seed `seed + i`."""
+        """Return random initial weights, with the seed `seed + i` for network i of a batch."""
         members = self.num_envs or 1
         generators = [np.random.default_rng(self.seed + i) for i in range(members)]
         arrays: dict[str, Array] = {}
@@ -162,20 +164,20 @@ class DirectNNController(Controller):
 
     @property
     def _batch_shape(self) -> tuple[int, ...]:
-        """The leading axis of the weights of a batch: (num_envs,), or () without a batch."""
+        """Shape of a batch of networks: (num_envs,), or () for a single network."""
         return () if self.num_envs is None else (self.num_envs,)
 
     @property
     def weights(self) -> Weights:
-        """A copy of the current weights; in a batch, each array has a leading batch axis.
+        """A copy of the current weights, with the networks of a batch on the first axis.
 
-        Weights that are assigned must have the shapes of the current weights. In a batch,
-        weights without a batch axis are assigned to all networks.
+        Assigned weights must have the shapes of the current weights. The weights of a single
+        network can be assigned to all networks of a batch.
 
         Raises
         ------
         ValueError
-            If an assigned array has a wrong shape or a value that is not finite. The error
+            If an assigned array has a wrong shape or a value that is not finite. A ValueError
             leaves the weights unchanged.
         """
         arrays: dict[str, Array] = {}
@@ -198,35 +200,31 @@ class DirectNNController(Controller):
             )
             batch = np.broadcast_to(array, (self.num_envs or 1, *shape))
             arrays.append(np.array(batch.T, order="C"))
-        # The arrays are stored in the order of the fields of `Weights`, and transposed: W has
-        # the shape (N, N_1, batch). With the batch axis last, sums over nodes add long rows,
-        # which is fast.
+        # The arrays are stored transposed, in the order of the fields of `Weights`: W has the
+        # shape (N, N_1, batch). With the batch axis last, the sums over nodes are fast, as they
+        # add long rows.
         self._arrays = arrays
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
-        """Refuse plants that the controller was not made for, by a ValueError.
+        """Raise a ValueError if the controller does not fit the plants of an environment.
 
-        The arguments are those of `Controller.check_environment`. In addition to the checks of
-        `Controller`, `num_envs` must equal the number of plants, `n`.
+        The arguments are described in `Controller.check_environment`. In addition to the checks
+        of `Controller`, `num_envs` must equal the number of plants, `n`.
         """
         super().check_environment(parameters, wrapped, n)
         if self.num_envs != n:
             raise ValueError(
-                f"policy must be made with num_envs={n}, one loop per episode, got "
-                f"{self.num_envs or 1}"
+                f"policy must have num_envs={n}, one loop per episode, got {self.num_envs or 1}"
             )
 
     def reset(self) -> None:
-        """Begin a new episode, but keep the weights that were learnt."""
+        """Begin a new episode, but keep the learnt weights."""
         super().reset()
         self._loop_shape = self._batch_shape
-        self._sample = 0  # k
+        self._sample = 0  # sample number k
 
     def _control(self, rows: Array) -> Array:
-        """Return the commands u(k), t/h, shape (loops,), and update the weights.
-
-        `rows` are the observations, shape (loops, size).
-        """
+        """Return the commands u(k), t/h, shape (loops,), and update the weights."""
         X = self.input_scale * np.ascontiguousarray(rows[:, : self.n_inputs].T)  # (N, batch)
         e = rows[:, self.error_index]
 
@@ -237,7 +235,8 @@ class DirectNNController(Controller):
 
         if self.learning and self._sample % self.update_interval == 0:
             delta_1 = e * self.direction * X_2 * (1.0 - X_2)  # equation (27) of the paper
-            # The paper's delta uses the weights W_1(k), so it comes before their update.
+            # The paper computes delta with W_1(k), so delta must be computed before W_1 is
+            # updated.
             delta = delta_1 * W_1 * X_1 * (1.0 - X_1)
             W_1 += self.eta_1 * delta_1 * X_1  # step C
             W += self.eta * delta * X[:, np.newaxis]  # step D
@@ -248,10 +247,10 @@ class DirectNNController(Controller):
 
 
 def _sum_of_rows(terms: Array) -> Array:
-    """Return the sum of `terms` over the first axis, added one row after the other.
+    """Return the sum of `terms` over the first axis, added row by row.
 
     With np.sum, the order of additions could depend on the batch size, and a network in a batch
-    would not equal a single network bit for bit.
+    would differ from a single network by rounding.
     """
     total: Array = np.add.accumulate(terms, axis=0)[-1]
     return total

@@ -1,8 +1,9 @@
-"""Choose targets for the output where the set point is known to change at random.
+"""Choose target outputs of a plant with a delay if the set point changes at random.
 
-A change of the flow shows in the output only after the delay. If the set point may change
-within the delay, the output with the least expected error lies between the present set point
-and 0, the middle of the range of set points. Aiming at such an output is called *hedging*.
+A change of the flow affects the output only after the delay of the plant. If the set point may
+change within the delay, the output with the least expected error lies between the present set
+point and 0, which is the mean of random set points. To choose a target between the set point
+and 0 is called *hedging*.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 
-BISECTIONS: Final = 10  # enough to find a target to 2^-10, a thousandth, of the set point
-# The logistic function of LOGISTIC x is within 0.01 of the standard normal distribution of x.
+BISECTIONS: Final = 10  # give a target with an error of at most 2^-11 of the set point
+# 1 / (1 + exp(-LOGISTIC x)) is within 0.01 of the standard normal distribution function.
 LOGISTIC: Final = 1.702
 
 
@@ -24,65 +25,60 @@ LOGISTIC: Final = 1.702
 class RandomSetpoint:
     """The distribution of a set point that changes at random, for n control loops.
 
-    The set point is piecewise constant. The values between changes, the *levels*, are uniformly
-    distributed and independent. The number of samples for which a level lasts is uniformly
-    distributed. Each field is a number for all loops, or an array of shape (n,).
+    The set point is piecewise constant. The values between two changes are independent and
+    uniformly distributed. The number of samples between two changes is uniformly distributed.
+    Each field is an array of shape (n,), or one number for all loops.
     """
 
     shortest: Array | float
-    """Least number of samples for which the set point keeps a level."""
+    """Least number of samples between two changes of the set point."""
     longest: Array | float
-    """Greatest number of samples for which the set point keeps a level."""
+    """Greatest number of samples between two changes of the set point."""
     amplitude: Array | float
-    """Greatest level of the set point, in the unit of the set points; the least level is
+    """Greatest value of the set point, in any unit of temperature; the least value is
     `-amplitude`."""
 
     def probability_held(self, ages: Array, ahead: Array) -> Array:
-        """Return the probability that the set point keeps its level for some more samples.
+        """Return the probability of no set point change in the next `ahead` samples, (n,).
 
         Parameters
         ----------
         ages
             Number of samples since the last change of the set point, shape (n,).
         ahead
-            Number of future samples for which the set point shall keep its level, shape (n,).
-
-        Returns
-        -------
-        ndarray
-            Shape (n,).
+            Number of future samples for which the probability is computed, shape (n,).
         """
-        durations = self.longest - self.shortest + 1.0  # number of the possible durations
-        # Shares of the possible durations of the level that are longer than its age, now and
-        # `ahead` samples later. The least share keeps the divisor from 0.
+        durations = self.longest - self.shortest + 1.0  # number of possible durations
+        # Share of the possible durations that are longer than `ages`, and share that are longer
+        # than `ages + ahead`. The lower bound 1e-9 prevents a division by 0.
         share_now = np.clip((self.longest - ages) / durations, 1e-9, 1.0)
         share_later = np.clip((self.longest - ages - ahead) / durations, 0.0, 1.0)
         probability: Array = share_later / share_now
         return probability
 
     def targets(self, setpoints: Array, held: Array, deviations: Array) -> Array:
-        """Return the target outputs with the least expected absolute error, shape (n,).
+        """Return target outputs with the least expected absolute control error, shape (n,).
 
-        The set point keeps its value s with the probability `held`; otherwise, the next set
-        point is uniformly distributed between -A and A, the amplitude. The output will differ
-        from the target r by an error of the forecast with the standard deviation `deviations`.
-        The expected absolute error is least at the target r for which
+        The set point keeps its present value s with the probability `held`. After a change, the
+        set point is uniformly distributed between -A and A, for the amplitude A. The future
+        output is the target r plus a forecast error with the standard deviation `deviations`.
+        The expected absolute control error is least at the target r for which
 
             held tanh(LOGISTIC (r - s) / (2 deviations)) + (1 - held) r / A = 0.
 
-        In the equation, the error of the forecast is assumed to have a logistic distribution,
-        and to be small compared with A. The left side of the equation rises with r, so
-        bisection between 0 and s finds r.
+        The equation assumes that the forecast error has a logistic distribution and is small
+        compared with A. The left side of the equation rises with r, so r is found by bisection
+        between 0 and s.
 
         Parameters
         ----------
         setpoints
-            Present set points s, in the unit of the amplitude, shape (n,).
+            Present set points s, in the unit of `amplitude`, shape (n,).
         held
-            Probabilities that the set points do not change within the delay, shape (n,).
-        deviations
-            Standard deviations of the forecasts' errors, in the unit of the amplitude, shape
+            Probabilities that the set points do not change within the plants' delays, shape
             (n,).
+        deviations
+            Standard deviations of the forecast errors, in the unit of `amplitude`, shape (n,).
         """
         slopes = 0.5 * LOGISTIC / deviations
         pulls_to_zero = (1.0 - held) / self.amplitude
@@ -95,4 +91,4 @@ class RandomSetpoint:
             near_zero = np.where(is_too_near_zero, targets, near_zero)
             near_setpoint = np.where(is_too_near_zero, near_setpoint, targets)
         targets = 0.5 * (near_zero + near_setpoint)
-        return np.where(held >= 1.0, setpoints, targets)  # exact for a set point that is kept
+        return np.where(held >= 1.0, setpoints, targets)  # exact if `held` is 1

@@ -18,9 +18,9 @@ Array = NDArray[np.float64]
 class InternalModelController(ModelBasedController):
     """A controller that runs a first-order model with a delay, in parallel with the plant.
 
-    The input of the model is the flow that the actuator passes after dead zone and limits, so
-    saturation of the actuator does not make the model wrong. The parameters are those of
-    `ModelBasedController`.
+    The input of the model is the flow that leaves the actuator, after dead zone and flow
+    limits, so saturation of the actuator does not make the model wrong. The parameters are
+    described in `ModelBasedController`.
     """
 
     def __post_init__(self) -> None:
@@ -30,29 +30,27 @@ class InternalModelController(ModelBasedController):
         self._delay = max(round(self.delay / self.sampling_interval), 1)  # samples
 
     def reset(self) -> None:
-        """Set the model's output to 0, as for a plant at rest, before a new episode."""
+        """Set the model's output to 0 before a new episode, as for a plant at rest."""
         super().reset()
-        # Outputs of the undelayed model within the delay, degC; the newest is last.
+        # Outputs of the undelayed model at the latest samples, as many as the delay, degC. The
+        # newest output is last.
         self._outputs: list[Values] = [np.float64(0.0)]
 
     @property
     def _undelayed(self) -> Values:
-        """The output of the undelayed model, degC, shape (loops,), or () at first."""
+        """Newest output of the undelayed model, degC; 0 before the first sample."""
         return self._outputs[-1]
 
     @property
     def _delayed(self) -> Values:
-        """The output of the delayed model, degC, shape (loops,), or () at first.
-
-        If the model is right, this output equals the output of a plant without noise and load.
-        """
+        """Newest output of the delayed model, degC; 0 before the first sample."""
         return self._outputs[0]
 
     def _command(self, wanted: Array) -> Array:
-        """Return the commands for wanted flows, and advance the model by a sample.
+        """Return the commands for wanted flows, both in t/h, and update the model's output.
 
         A wanted flow inside the dead zone is moved to 0 or to the edge of the dead zone,
-        whichever is nearer. The wanted flows and the commands are in t/h, shape (loops,).
+        whichever is nearer.
         """
         command: Array = avoid_dead_zone(wanted, self.dead_zone)
         applied = applied_flow(command, self.dead_zone, self.u_min, self.u_max)

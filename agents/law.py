@@ -1,12 +1,13 @@
-"""Choose flows by the predictions of a bank of models and of a Kalman filter.
+"""Compute flows from the predictions of a bank of candidate models and of Kalman filters.
 
-As in a Smith predictor, the models predict the effect of flows that have not yet shown in the
-output. The Kalman filter forecasts the part of the output that the models do not explain. The
+As in a Smith predictor, the models predict the effect of past flows that have not yet affected
+the output. Kalman filters forecast the part of the output that the models do not explain. The
 next flow moves the predicted output towards a target.
 
-The control law runs both in NumPy and in PyTorch. With PyTorch, a neural network that corrects
-the control law is trained by gradients. Quantities are scaled as in `agents.bank`: flows by
-half the actuator's range, temperatures by the authority, and times by the sampling interval.
+The control law runs both in NumPy and in PyTorch. In PyTorch, a neural network that corrects
+the control law is trained by gradients. Quantities are dimensionless as in `agents.bank`: flows
+are divided by half the flow range, temperatures by the steady temperature change for half the
+flow range, and times by the sampling interval.
 """
 
 from __future__ import annotations
@@ -25,113 +26,118 @@ from agents.output_filter import LOAD_CHANGES, OutputFilter
 
 Array = NDArray[np.floating[Any]]
 
-SHARE: Final = 0.5  # share of the way to the target that one sample covers, without a network
-# Standard deviation of the error of a forecast over the delay, as a multiple of the standard
+SHARE: Final = 0.5  # share of the gap to the target that one sample closes, without a network
+# Standard deviation of a forecast over the plant's delay, as a multiple of the standard
 # deviation of the noise.
 FORECAST_SPREAD: Final = 1.2
-REACTION: Final = 2.0  # samples that the output takes, after the delay, to follow a flow
-# Errors that are inputs of a network are limited to this multiple of the noise, as larger
-# errors are outliers.
+REACTION: Final = 2.0  # samples, after the delay, that the output takes to respond to a flow
+# Limit of the errors that are inputs of a network, as a multiple of the noise's standard
+# deviation. Larger errors are outliers.
 LARGEST_ERROR: Final = 12.0
-# Added to the standard deviation of the noise, in units of the authority. Without it, tiny
-# errors of the models would count as signals where there is hardly any noise.
+# Number that is added to the noise's standard deviation, in units of the steady temperature
+# change for half the flow range. Without this addition, tiny model errors would be taken for
+# signals on a plant with hardly any noise.
 MODEL_ERROR: Final = 0.002
-# Delay, samples, and natural logarithm of the time constant in samples, of the paper's plant,
-# equation (28). They centre the inputs of a network.
+# Delay of the paper's plant, equation (28), in samples, and natural logarithm of this plant's
+# time constant in samples. Two inputs of a network are differences from these two numbers.
 TYPICAL_DELAY: Final = 18.0
 TYPICAL_LOG_CONSTANT: Final = 3.0
 
-# Numbers of inputs and outputs of a network. `PAST_INPUTS` inputs come from the observer, and
-# five more from the control law's models and last flow. The outputs correct the control law.
+# Numbers of inputs and outputs of a network that corrects the control law. `PAST_INPUTS` inputs
+# come from `Observer`, and five inputs from the models and the last flow of `Law`.
 PAST_INPUTS: Final = 21 + LAGS + len(LOAD_CHANGES)
 INPUTS: Final = PAST_INPUTS + 5
 OUTPUTS: Final = 3
 
-# A network maps inputs of shape (n, INPUTS), for n loops, to outputs of shape (n, OUTPUTS).
+# Function that maps network inputs, shape (n, INPUTS), to outputs, shape (n, OUTPUTS).
 Network = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
 class Situation:
-    """The knowledge about n control loops at a sample, by which flows are chosen."""
+    """Estimates of n plants at one sample, from which the control law computes flows."""
 
     targets: Array
-    """Target of the mean model's output at the time when the present flow shows, in units of
-    the authority, shape (n,): the hedged set point (see `agents.hedge`) minus the forecast of
-    the part of the output that the models do not explain."""
+    """Target of the mean model's output when the present flow affects the output, shape (n,).
+    The target is the hedged set point (see `agents.hedge`) minus the forecast of the part of
+    the output that the models do not explain, in units of the steady temperature change for
+    half the flow range."""
     shares: Array
-    """Probabilities of the bank's time constants, shape (time constants, n)."""
+    """Probabilities of the candidate time constants, shape (time constants, n)."""
     pole: Array
-    """Pole of the mean model: the mean of exp(-1 / T) over the bank's time constants T in
-    samples, shape (n,)."""
+    """Estimated pole of the plant: the mean of exp(-1 / T) over the candidate time constants T
+    in samples, shape (n,)."""
     gain: Array
-    """Estimated gain of the plant, as a multiple of the step test's gain, shape (n,)."""
+    """Estimated gain of the plant, divided by the gain that the step test measured, shape
+    (n,)."""
     gain_spread: Array
-    """Standard deviation of `gain`, shape (n,)."""
+    """Standard deviation of the estimated gain, in the unit of `gain`, shape (n,)."""
     noise: Array
-    """Standard deviation of the bank's one-step errors, plus `MODEL_ERROR`, in units of the
-    authority, shape (n,)."""
+    """Standard deviation of the models' one-step prediction errors, plus the constant
+    `MODEL_ERROR`, in units of the steady temperature change for half the flow range, shape
+    (n,)."""
     inputs: Array
-    """Inputs of a network that come from the observer, shape (n, PAST_INPUTS)."""
+    """Inputs of a correcting network that `Observer` computes, shape (n, PAST_INPUTS)."""
 
 
 class Observer:
-    """The memory of n control loops: bank of models, Kalman filters, and age of the set point.
+    """Estimator of n plants: candidate models, Kalman filters, and the age of the set point.
 
-    The observer uses NumPy alone, so no gradient of PyTorch passes through it.
+    The computation is in NumPy, so PyTorch gradients do not pass through the estimates.
 
     Parameters
     ----------
     bank
-        The bank of models, for n plants at rest.
-    edge
-        Greatest half width that the dead zone may have, as a share of half the actuator's
-        range, shape (n,); 0 for an actuator without a dead zone.
+        Bank of candidate models for n plants at rest.
+    dead_zone_edge
+        Greatest possible half width of the dead zone, as a share of half the flow range, shape
+        (n,); 0 for an actuator without a dead zone.
     limits
-        Lowest and highest flow, as shares of half the actuator's range, each of shape (n,).
+        Lowest and highest flow, as shares of half the flow range, each of shape (n,).
     setpoint
-        The distribution of random set points, in units of the authority; None if nothing is
-        known about changes of the set points.
+        Distribution of random set points, in units of the steady temperature change for half
+        the flow range; None if the distribution is unknown.
 
     Attributes
     ----------
     filter : OutputFilter
-        The Kalman filters of gain and load.
+        Kalman filters that estimate the gain and the load disturbance of each plant.
     """
 
     def __init__(
         self,
         bank: Bank,
-        edge: Array,
+        dead_zone_edge: Array,
         limits: tuple[Array, Array],
         setpoint: RandomSetpoint | None = None,
     ) -> None:
         self.filter = OutputFilter(bank.gain_spread)
         self._bank = bank
-        self._edge = edge
-        self._centre = (limits[0] + limits[1]) / 2.0
+        self._dead_zone_edge = dead_zone_edge
+        self._middle_flow = (limits[0] + limits[1]) / 2.0
         self._random_setpoint = setpoint
         self._setpoint: Array | None = None
-        self._age: Array = np.zeros(bank.n)  # samples since the set point changed
+        self._age: Array = np.zeros(bank.n)  # samples since the last change of the set point
         self._k = 0
 
     def observe(self, setpoint: Array, output: Array) -> Situation:
-        """Update the memory with a sample of each loop, and return the present situation.
+        """Return the estimates of the n plants from the set points and outputs of a sample.
 
-        Call this method once per sample, before the flow is chosen.
+        Call this method once per sample, before the flow of this sample is computed.
 
         Parameters
         ----------
         setpoint
-            Set points y_d(k), in units of the authority (see `agents.bank`), shape (n,).
+            Set points y_d(k), in units of the steady temperature change for half the flow
+            range, shape (n,).
         output
-            Measured outputs y(k), in units of the authority, shape (n,).
+            Measured outputs y(k), in the unit of `setpoint`, shape (n,).
         """
         bank = self._bank
         bank.observe(output)
         self.filter.update(output, bank.responses[:2], bank.pole, bank.variance)
         forecast = self.filter.forecast(bank.pole, bank.fading)
-        # At the first sample, the set point counts as unchanged.
+        # At the first sample of an episode, there is no earlier set point to differ from.
         is_unchanged = self._setpoint is None or setpoint == self._setpoint
         self._age = np.where(is_unchanged, self._age + 1.0, 0.0)
         self._setpoint = setpoint
@@ -164,30 +170,26 @@ class Observer:
         forecast: Array,
         noise: Array,
     ) -> Array:
-        """Return the observer's inputs of a network, scaled to magnitudes of about 1.
+        """Return inputs of the correcting network, of sizes near 1, shape (n, PAST_INPUTS).
+
+        All arguments have the shape (n,), and temperatures are in units of the steady
+        temperature change for half the flow range.
 
         Parameters
         ----------
         setpoint
-            Set points y_d(k), in units of the authority (see `agents.bank`), shape (n,).
+            Set points y_d(k).
         output
-            Measured outputs y(k), in units of the authority, shape (n,).
+            Measured outputs y(k).
         aim
-            Hedged set points (see `agents.hedge`), in units of the authority, shape (n,).
+            Hedged set points, from `RandomSetpoint.targets`.
         held
-            Probabilities that the set points do not change before the present flow shows,
-            shape (n,).
+            Probabilities that the set points do not change before the present flows affect the
+            outputs.
         forecast
-            Forecasts of the part of the output that the models do not explain, in units of the
-            authority, shape (n,).
+            Forecasts of the part of the output that the models do not explain.
         noise
-            Standard deviations of one-step errors, plus `MODEL_ERROR`, in units of the
-            authority, shape (n,).
-
-        Returns
-        -------
-        ndarray of float32
-            Shape (n, PAST_INPUTS).
+            Standard deviations of the models' one-step prediction errors, plus `MODEL_ERROR`.
         """
         bank = self._bank
         load = self.filter.load
@@ -199,14 +201,14 @@ class Observer:
             np.abs(setpoint),
             aim - setpoint,
             held,
-            # the output, and what the models do not explain
+            # the output, and the part of the output that the models do not explain
             output,
             load,
             forecast - load,
             *_relative_errors(residuals, noise),
             _relative_errors(bank.innovation, noise),
             _relative_errors(self.filter.innovation, noise),
-            # the estimates of filters and bank
+            # the estimates of the Kalman filters and of the candidate models
             *self.filter.weights,
             3.0 * np.log(gain),
             5.0 * self.filter.gain_spread,
@@ -217,8 +219,8 @@ class Observer:
             0.5 * np.log(noise) + 1.5,
             2.0 * bank.fading - 1.0,
             # the actuator, and the time since the start of the episode
-            self._edge,
-            self._centre,
+            self._dead_zone_edge,
+            self._middle_flow,
             np.full(bank.n, min(self._k / 600.0, 2.0)),
             np.full(bank.n, min(self._k / 60.0, 1.0)),
         ]
@@ -226,77 +228,78 @@ class Observer:
 
 
 def _relative_errors(errors: Array, noise: Array) -> Array:
-    """Return half of errors / noise, after the ratios are limited to +-`LARGEST_ERROR`.
+    """Return errors / (2 noise) in the shape of `errors`, clipped to +-`LARGEST_ERROR` / 2.
 
-    `errors` have the shape (n,) or (lags, n), like the result, and `noise`, the standard
-    deviations of the noise, the shape (n,).
+    `errors` have the shape (n,) or (lags, n). `noise` are standard deviations, shape (n,).
     """
     ratios: Array = 0.5 * np.clip(errors / noise, -LARGEST_ERROR, LARGEST_ERROR)
     return ratios
 
 
 class Law:
-    """The control law of n control loops: it computes flows from a `Situation`.
+    """The control law of n control loops, which computes flows from estimates of the plants.
 
-    The mean model has the output m without delay, the gain g and the pole p. For the target r,
-    the flow is
+    The mean of the candidate models has the gain g, the pole p and, without the delay, the
+    output m. For a target r of the output, the control law computes the flow
 
         f = (r + share (r - m) / (1 - p)) / g.
 
-    The flow f is then moved out of the dead zone and limited. The term r / g is the flow that
-    keeps m at r, and the other term closes a share of the gap r - m in one sample. A neural
-    network can correct the control law by three outputs: an addition to r in units of the
-    noise, a relative change of r in units of the gain's standard deviation, and half the logit
-    of the share.
+    Then the control law moves the flow f out of the dead zone, and clips f to the flow limits.
+    The part r / g of the flow keeps the output m at the target r. The other part closes the
+    fraction `share` of the gap r - m in one sample. A neural network can correct the control
+    law by three outputs:
+
+    - a number that is added to r, in units of the noise's standard deviation,
+    - a relative change of r, in units of the standard deviation of the estimated gain,
+    - half the logit of `share`.
 
     Parameters
     ----------
     bank
-        The bank of models. The control law runs the bank's models without delay once more, so
-        that the gradients of PyTorch reach past flows.
-    edge
-        Greatest half width that the dead zone may have, as a share of half the actuator's
-        range, shape (n,); 0 for an actuator without a dead zone.
+        Bank of candidate models. The control law runs copies of the undelayed models, through
+        which PyTorch gradients with respect to past flows can pass.
+    dead_zone_edge
+        Greatest possible half width of the dead zone, as a share of half the flow range, shape
+        (n,); 0 for an actuator without a dead zone.
     limits
-        Lowest and highest flow, as shares of half the actuator's range, each of shape (n,).
+        Lowest and highest flow, as shares of half the flow range, each of shape (n,).
     xp
-        The array module: NumPy, or PyTorch to compute gradients.
+        Array module: `numpy`, or `torch` to compute gradients.
     convert
-        Function that converts a NumPy array to an array of `xp`.
+        Function that converts a NumPy array to an array of the module `xp`.
     """
 
     def __init__(
         self,
         bank: Bank,
-        edge: Any,
+        dead_zone_edge: Any,
         limits: tuple[Any, Any],
         xp: Any = np,
         convert: Callable[[Array], Any] = np.asarray,
     ) -> None:
         self._xp = xp
         self._convert = convert
-        self._edge = convert(edge)
+        self._dead_zone_edge = convert(dead_zone_edge)
         self._lowest = convert(limits[0])
         self._highest = convert(limits[1])
         self._models = UndelayedModels(bank.time_constants, convert)
 
     def flow(self, situation: Situation, network: Network | None = None) -> Any:
-        """Return the flows of a sample, as shares of half the actuator's range, shape (n,).
+        """Return the flows of a sample, as shares of half the flow range, shape (n,).
 
-        Each flow is 0 or passes the dead zone, and lies within the limits. The models advance
-        by a sample with these flows, so call this method once per sample.
+        Each flow is within the flow limits, and is 0 or outside the dead zone. Call this method
+        once per sample, as the call also updates the outputs of the models.
 
         Parameters
         ----------
         situation
-            The knowledge about the loops at this sample, from `Observer.observe`.
+            Estimates of the plants from `Observer.observe`.
         network
-            The network that corrects the control law. Without a network, the control law is
-            linear apart from the dead zone and the limits.
+            Network that corrects the control law; None for the control law without corrections.
         """
         xp, convert = self._xp, self._convert
         gain = convert(situation.gain)
-        gains = gain * convert(situation.shares)  # factors of the models in the mean model
+        gains = gain * convert(situation.shares)  # factors of the models' outputs in the mean
         model_output = (gains * self._models.outputs).sum(0)
         target = convert(situation.targets)
         share: Any = SHARE
@@ -306,14 +309,14 @@ class Law:
             shift = outputs[:, 0]
             stretch = outputs[:, 1]
             half_logit = outputs[:, 2]
-            # Without noise, the shift is 0, so that it leaves no offset.
+            # The shift is 0 for a plant without noise, and then causes no steady control error.
             noise = convert(situation.noise - LEAST_NOISE - MODEL_ERROR)
             spread = convert(situation.gain_spread)
             target = target * (1.0 + spread * stretch) + noise * shift
-            # The limits keep exp from an overflow.
+            # The exponent is clipped to prevent an overflow.
             share = 1.0 / (1.0 + xp.exp(xp.clip(-2.0 * half_logit, -20.0, 20.0)))
-        # The flow for `target` holds the output there, and the flow for `approach` closes a
-        # share of the gap in one sample.
+        # The flow target / gain keeps the output at the target. The flow approach / gain closes
+        # a share of the gap to the target in one sample.
         rate = 1.0 - convert(situation.pole)
         approach = share / rate * (target - model_output)
         flow = self._passable((target + approach) / gain)
@@ -321,10 +324,11 @@ class Law:
         return flow
 
     def _inputs(self, situation: Situation, model_output: Any, change: Any) -> Any:
-        """Return all inputs of a network, with magnitudes of about 1, shape (n, INPUTS).
+        """Return all inputs of the correcting network, of sizes near 1, shape (n, INPUTS).
 
-        `model_output` is the output of the mean model without delay, and `change` its change
-        since the last sample, both in units of the authority, shape (n,).
+        `model_output` is the output of the mean model without delay, and `change` is the
+        difference from its value at the previous sample, both of shape (n,), in units of the
+        steady temperature change for half the flow range.
         """
         xp = self._xp
         gap = self._convert(situation.targets) - model_output
@@ -334,17 +338,17 @@ class Law:
         return xp.concatenate([past_inputs, xp.stack(signals, axis=1)], axis=1)
 
     def _passable(self, wanted: Any) -> Any:
-        """Return wanted flows after they are moved out of the dead zone and limited.
+        """Return wanted flows, moved out of the dead zone and clipped to the flow limits.
 
-        `wanted` and the returned flows are in units of half the actuator's range, shape (n,).
-        In PyTorch, the move out of the dead zone counts as a constant for gradients.
+        Flows are shares of half the flow range, shape (n,). For PyTorch gradients, the move out
+        of the dead zone counts as a constant.
         """
         constant = wanted.detach() if self._xp is not np else wanted
-        move = avoid_dead_zone(constant, self._edge, self._xp) - constant
+        move = avoid_dead_zone(constant, self._dead_zone_edge, self._xp) - constant
         return self._xp.clip(wanted + move, self._lowest, self._highest)
 
     def detach(self) -> None:
-        """Cut the PyTorch graph, so that later gradients do not reach earlier flows."""
+        """Detach the models from the PyTorch graph, so that gradients end at this sample."""
         models = self._models
         models.outputs = models.outputs.detach()
         models.last_outputs = models.last_outputs.detach()

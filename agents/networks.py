@@ -1,6 +1,6 @@
-"""Run trained feed-forward networks in NumPy alone, and read and write network files.
+"""Compute trained feed-forward networks in NumPy, and read and write network files.
 
-A network file may come from an untrusted source: nothing in the file is executed.
+Loading a network file from an untrusted source is safe, as no code in the file is executed.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from numpy.typing import ArrayLike, NDArray
 from agents.controller import Controller, Values, check_numbers, integer_from_0, not_negative
 
 Array = NDArray[np.floating[Any]]
-# The layers of a network, from the inputs on: a pair of weights, shape (outputs, inputs), and
-# biases, shape (outputs,), for each layer.
+# Layers of a network in the order of computation. Each layer is a pair of weights, shape
+# (outputs, inputs), and biases, shape (outputs,).
 Layers = Sequence[tuple[Array, Array]]
 
-# Arguments of the environment that determine the observation, in the order of its elements.
+# Arguments of the environment that choose the elements of an observation, in their order.
 WINDOWS: Final = ("setpoint_window", "error_window", "output_window", "action_window")
 PRETRAINED: Final = Path(__file__).parent / "pretrained"  # trained networks of this project
-# Largest size of all unpacked arrays of a network file, bytes: 64 MiB, hundreds of times what a
-# network needs. A larger file could exhaust the memory.
+# Largest total size of the unpacked arrays in a network file, bytes. A larger file could
+# exhaust the memory, and no network of this project needs a hundredth of 64 MiB.
 LARGEST_FILE: Final = 2**26
 FORMAT: Final = 1  # version of the format of network files
 # The activation functions of hidden layers, by name.
@@ -42,16 +42,16 @@ ACTIVATIONS: Final[Mapping[str, Callable[[Array], Array]]] = {
 def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.float64]:
     """Return the outputs of a feed-forward network, shape (..., outputs).
 
-    The network is computed in float32, as in its training. The order of additions in a matrix
-    product depends on the batch size, so the outputs for the same inputs can differ by about
-    1e-6 between batch sizes.
+    The network is computed in float32, as in training. The batch size changes the order of
+    additions in matrix products, so outputs for the same inputs can differ by about 1e-6
+    between batch sizes.
 
     Parameters
     ----------
     layers
-        Weights and biases of each layer. The last layer has no activation.
+        Weights and biases of each layer. The last layer has no activation function.
     activation
-        Name of the activation of the hidden layers, a key of `ACTIVATIONS`.
+        Name of the activation function of the hidden layers, a key of `ACTIVATIONS`.
     inputs
         Inputs of the network, shape (..., inputs).
     """
@@ -66,25 +66,26 @@ def forward(layers: Layers, activation: str, inputs: ArrayLike) -> NDArray[np.fl
 def check_array(
     name: str, value: ArrayLike, *shapes: tuple[int, ...], dtype: Any = np.float32
 ) -> NDArray[Any]:
-    """Return a copy of an array that has an allowed shape and only finite values.
+    """Return a copy of an array after a check that its shape is allowed and its values finite.
 
     Parameters
     ----------
     name
-        Name of the array, for the message of an error.
+        Name of the array for error messages.
     value
         The array to check.
     *shapes
-        The allowed shapes.
+        Allowed shapes of the array.
     dtype
-        Type of the copy's elements.
+        NumPy type of the returned copy.
 
     Raises
     ------
     ValueError
-        If the array has another shape, is not numeric, or has a value that is not finite.
+        If the array is not numeric, has a shape that is not allowed, or has a value that is not
+        finite.
     """
-    # A number that is too large for float32 becomes infinite, which is refused below.
+    # A number that is too large for float32 becomes infinite, which is an error below.
     with np.errstate(over="ignore"):
         array = np.array(check_numbers(name, value), dtype)
     if array.shape not in shapes:
@@ -95,10 +96,10 @@ def check_array(
 
 
 def _checked_layers(layers: Layers, inputs: int) -> Layers:
-    """Return copies of a network's layers in float32, if their shapes fit.
+    """Return float32 copies of the layers of a network after a check of shapes and values.
 
-    A ValueError is raised if there is no layer, if the network has not `inputs` inputs and one
-    output, if the shapes of two layers do not fit, or if a value is not finite.
+    A ValueError is raised if `layers` is empty, if the shapes of layers do not fit together, if
+    the network does not have `inputs` inputs and one output, or if a value is not finite.
     """
     if not layers:
         raise ValueError("layers must hold at least one layer, got none")
@@ -109,7 +110,7 @@ def _checked_layers(layers: Layers, inputs: int) -> Layers:
         weights = check_array(f"weights of layers[{i}]", W, (nodes, inputs))
         biases = check_array(f"biases of layers[{i}]", b, (nodes,))
         checked.append((weights, biases))
-        inputs = nodes  # of the next layer
+        inputs = nodes  # number of inputs of the next layer
     return checked
 
 
@@ -119,20 +120,18 @@ def open_arrays(
 ) -> Iterator[Mapping[str, NDArray[Any]]]:
     """Open an `.npz` file as a mapping of arrays by name, for a `with` statement.
 
-    Nothing in the file is executed.
-
     Parameters
     ----------
     path
-        The file.
+        Path of the file.
     contents
-        What the file should hold, in words, for the message of an error.
+        Expected contents of the file in words, such as "weights", for error messages.
 
     Raises
     ------
     ValueError
-        If the file is damaged or larger than `LARGEST_FILE`, or if the `with` block raises an
-        error, as the contents of the file then are wrong.
+        If the file is damaged or its arrays are larger than `LARGEST_FILE`. An error in the
+        `with` block becomes a ValueError, because the file then has wrong contents.
     OSError
         If the file cannot be opened.
     """
@@ -141,46 +140,49 @@ def open_arrays(
             with np.load(raw, allow_pickle=False) as file:
                 size = sum(member.file_size for member in file.zip.infolist())
                 if size > LARGEST_FILE:
-                    raise ValueError(f"its arrays have {size:,} bytes, over {LARGEST_FILE:,}")
+                    raise ValueError(
+                        f"the unpacked arrays have {size:,} bytes, over {LARGEST_FILE:,}"
+                    )
                 yield file
         except Exception as error:  # from zip, zlib, NumPy, JSON or a check
             raise ValueError(f"{path} holds no {contents}, or is damaged: {error}") from error
 
 
 def write_arrays(path: str | PathLike[str], **arrays: Any) -> None:
-    """Write arrays by name to the `.npz` file `path`, which `open_arrays` reads."""
-    with Path(path).open("wb") as file:  # as NumPy appends ".npz" to a path without it
+    """Write named arrays to the `.npz` file `path`."""
+    with Path(path).open("wb") as file:  # given a path, NumPy would append ".npz"
         np.savez_compressed(file, **arrays)
 
 
 def read_settings(file: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Return the settings in a network file: the JSON object in the array `about`.
 
-    `file` is what `open_arrays` yields. A ValueError is raised if the file has another format
-    than `FORMAT`.
+    The argument `file` is an open network file, from `open_arrays`. A ValueError is raised if
+    the format version in the settings is not `FORMAT`.
     """
     settings: dict[str, Any] = json.loads(str(file["about"]))
     if settings["format"] != FORMAT:
-        raise ValueError(f"its format is {settings['format']!r}, not {FORMAT}")
+        raise ValueError(f"the format version must be {FORMAT}, got {settings['format']!r}")
     return settings
 
 
 @dataclass(frozen=True)
 class Increments:
-    """Settings of the velocity form, in which a network's output changes a *wanted flow*.
+    """Settings of a controller in velocity form, whose network changes a wanted flow.
 
-    The wanted flow is 0 at the start of an episode. The command follows from the wanted flow by
-    a compensation of the actuator's dead zone.
+    The wanted flow is 0 at the start of an episode. At each sample, the wanted flow changes by
+    `max_move` times the output of the network. The command is the wanted flow with a
+    compensation of the actuator's dead zone.
     """
 
     max_move: float
-    """Change of the wanted flow per sample if the network's output is 1, as a share of half the
-    actuator's range."""
+    """Change of the wanted flow per sample for the network output 1, as a share of half the
+    flow range of the actuator."""
     dead_zone: float = 0.0
-    """Half width z of the dead zone that is compensated, t/h; 0 for no compensation. A wanted
-    flow v of 0 gives the command 0, a positive v gives z + (u_max - z) v / u_max, and a
-    negative v gives -z + (u_min + z) v / u_min. If a limit of the flow lies inside the dead
-    zone, the edge of the dead zone is commanded instead of this limit."""
+    """Half width z of the compensated dead zone, t/h; 0 for no compensation. The command is z +
+    (u_max - z) v / u_max for a positive wanted flow v, t/h, -z + (u_min + z) v / u_min for a
+    negative v, and 0 for v = 0. A flow limit inside the dead zone is replaced by the edge of
+    the dead zone."""
 
     def __post_init__(self) -> None:
         not_negative("max_move", self.max_move)
@@ -191,30 +193,31 @@ class Increments:
 class PolicyNetwork(Controller):
     """A feed-forward network from the latest observation to an action.
 
-    The observation is multiplied by `input_scale` and passed through the layers. An activation
-    follows every layer but the last layer, whose single output is clipped to [-1, 1]. The
-    clipped output is the action or, with `increments`, changes a wanted flow. The layers are
-    computed in float32, so the action for an observation can differ by rounding between a batch
-    and a single loop; see `forward`.
+    The input of the network is the observation times `input_scale`. Every layer except the last
+    is followed by an activation function, and the single output of the last layer is clipped to
+    [-1, 1]. Without `increments`, the clipped output is the action. The network is computed in
+    float32, so the action for an observation can differ by rounding between a batch and a
+    single loop.
 
-    The arguments `u_min` and `u_max` are those of `Controller`.
+    The arguments `u_min` and `u_max` are described in `Controller`.
 
     Parameters
     ----------
     layers
         Weights, shape (outputs, inputs), and biases, shape (outputs,), of each layer.
     observation
-        The observation that the network expects: the environment's arguments `setpoint_window`,
-        `error_window`, `output_window` and `action_window`, by name. An argument that is not
-        named is 0.
+        Arguments of the environment whose observations the network expects: a dict with any of
+        the names `setpoint_window`, `error_window`, `output_window` and `action_window`, where
+        a missing name counts as 0.
     input_scale
-        Factor for each element of the observation; shape (n_obs,).
+        Factors by which the elements of an observation are multiplied, shape (n_obs,).
     activation
-        Activation of the hidden layers: "elu", "relu", "silu" or "tanh".
+        Activation function of the hidden layers: "elu", "relu", "silu" or "tanh".
     increments
-        Settings of the velocity form; None if the network's output is the action itself.
+        Settings with which the network's output changes a wanted flow; None if the network's
+        output is the action.
     provenance
-        How the network was trained, for the network's file; JSON-serialisable.
+        Description of the training, which `save` writes to the file; JSON-serialisable.
     """
 
     layers: Layers = field(repr=False, kw_only=False)
@@ -228,13 +231,15 @@ class PolicyNetwork(Controller):
         super().__post_init__()
         for name in self.observation:
             if name not in WINDOWS:
-                raise ValueError(f"observation must name {', '.join(WINDOWS)}, got {name!r}")
+                raise ValueError(
+                    f"observation must have only the keys {', '.join(WINDOWS)}, got {name!r}"
+                )
         self.observation = {
             name: integer_from_0(f"observation[{name!r}]", self.observation.get(name, 0))
             for name in WINDOWS
         }
         self.n_obs = sum(self.observation.values())
-        if self.activation not in [*ACTIVATIONS]:  # a list, as `activation` may be unhashable
+        if self.activation not in [*ACTIVATIONS]:  # a list, as a dict needs a hashable key
             raise ValueError(
                 f"activation must be one of {[*ACTIVATIONS]}, got {self.activation!r}"
             )
@@ -249,19 +254,21 @@ class PolicyNetwork(Controller):
     def load(
         cls, path: str | PathLike[str], *, u_min: float = -10.0, u_max: float = 10.0
     ) -> PolicyNetwork:
-        """Return the network in a file that was written by `save`.
+        """Return the network in an `.npz` file that the method `save` has written.
 
         Parameters
         ----------
         path
-            The file.
+            Path of the file.
         u_min, u_max
-            Limits of the actuator, t/h, as of `Controller`; files do not hold limits.
+            Lower and upper limit of the actuator's flow, t/h. A network file does not contain
+            flow limits.
 
         Raises
         ------
         ValueError
-            If the file is damaged or holds something else, or if a limit is out of range.
+            If the file is damaged or contains no policy network, or if a flow limit is out of
+            range.
         OSError
             If the file cannot be opened.
         """
@@ -278,11 +285,11 @@ class PolicyNetwork(Controller):
                 increments=increments,
                 provenance=settings["provenance"],
             )
-        # Outside the `with` block: invalid limits do not mean that the file is damaged.
+        # Outside the `with` block, an error for invalid flow limits does not blame the file.
         return replace(network, u_min=u_min, u_max=u_max)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the network, without the limits of the flow, to the `.npz` file `path`."""
+        """Write the network, without the flow limits, to the `.npz` file `path`."""
         settings = {
             "format": FORMAT,
             "layers": len(self.layers),
@@ -298,34 +305,34 @@ class PolicyNetwork(Controller):
         write_arrays(path, about=json.dumps(settings), input_scale=self.input_scale, **arrays)
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
-        """Refuse plants that the network was not made for, by a ValueError.
+        """Raise a ValueError if the network does not fit the plants of an environment.
 
-        The arguments are those of `Controller.check_environment`. In addition to the checks of
-        `Controller`, the plants must have the observation that the network expects.
+        The arguments are described in `Controller.check_environment`. In addition to the checks
+        of `Controller`, the environment must have the observations that the network expects.
         """
         super().check_environment(parameters, wrapped, n)
         windows = {name: getattr(parameters, name) for name in WINDOWS}
         if windows != self.observation:
             raise ValueError(
-                f"env must have the windows that policy wants, {self.observation}, "
-                f"got {windows}"
+                f"env must have the observations that policy expects, "
+                f"{self.observation}, got {windows}"
             )
 
     def reset(self) -> None:
-        """Set the wanted flow of the velocity form to 0, before a new episode."""
+        """Set the wanted flow to 0, before a new episode."""
         super().reset()
-        # The wanted flow, in units of half the actuator's range.
+        # Wanted flow of the velocity form, as a share of half the flow range.
         self._flow: Values = np.float64(0.0)
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the commands u(k), t/h, shape (loops,), and update the wanted flow.
 
-        `rows` are the observations, shape (loops, n_obs); any other size raises a ValueError.
+        A ValueError is raised unless the observations `rows` have the shape (loops, n_obs).
         """
         if rows.shape[1] != self.n_obs:
             raise ValueError(
                 f"observation must have {self.n_obs} elements, got {rows.shape[1]}: "
-                f"make the environment with the network's `observation`, {self.observation}"
+                f"make the environment with the arguments {self.observation}"
             )
         outputs = forward(self.layers, self.activation, rows * self.input_scale)
         output = np.clip(outputs[:, 0], -1.0, 1.0)
@@ -341,14 +348,14 @@ class PolicyNetwork(Controller):
         return self._compensated(self.increments.dead_zone)
 
     def _compensated(self, edge: float) -> NDArray[np.float64]:
-        """Return the commands for the wanted flows, t/h, with the dead zone compensated.
+        """Return the commands, t/h, shape (loops,), for the wanted flows and a dead zone.
 
-        The rule is that of `Increments.dead_zone`. `edge` is the half width of the dead zone,
-        t/h, and the commands have the shape (loops,).
+        `edge` is the half width of the dead zone, t/h.
         """
         flow = self._flow
         half_range = (self.u_max - self.u_min) / 2.0
-        # The limit in the direction of the flow, t/h; any number other than 0 for a flow of 0.
+        # Size of the flow limit in the direction of the wanted flow, t/h. For a flow of 0, the
+        # size does not matter, but 0 would cause a division by 0.
         limit = np.where(flow > 0.0, self.u_max, np.where(flow < 0.0, -self.u_min, 1.0))
         share = np.abs(flow) * (half_range / limit)
         size = edge + share * np.maximum(limit - edge, 0.0)

@@ -1,7 +1,8 @@
-"""Estimate a plant's gain and load disturbance by Kalman filters, and forecast its output.
+"""Estimate the gains and load disturbances of plants by Kalman filters.
 
-Quantities are scaled as in `agents.bank`: flows by half the actuator's range, temperatures by
-the authority, and times by the sampling interval.
+Quantities are dimensionless as in `agents.bank`: flows are divided by half the flow range,
+temperatures by the steady temperature change for half the flow range, and times by the sampling
+interval.
 """
 
 from __future__ import annotations
@@ -15,68 +16,74 @@ from agents.bank import FAST_POLE, GAIN_LIMITS, LIKELIHOOD_FACTOR, NOISE_COLOUR
 
 Array = NDArray[np.floating[Any]]
 
-# Each of the four filters assumes a standard deviation of the change of the load per sample, as
-# a share of the authority (`LOAD_CHANGES`), and a noise variance, as a share of the variance of
-# the bank's one-step errors (`NOISE_SHARES`). The last filter is for plants with hardly any
-# noise, where the bank's one-step errors come from the load.
+# Assumptions of each of the four Kalman filters. `LOAD_CHANGES` are standard deviations of the
+# change of the load disturbance per sample, in units of the steady temperature change for half
+# the flow range. `NOISE_SHARES` are noise variances divided by the variance of the candidate
+# models' one-step prediction errors. The last filter is for plants with hardly any noise, whose
+# prediction errors come from the load disturbance.
 LOAD_CHANGES: Final = np.array([0.001, 0.007, 0.03, 0.03])
 NOISE_SHARES: Final = np.array([1.0, 1.0, 1.0, 0.25])
-LOAD_MEMORY: Final = 0.998  # share of the load that is expected to remain after a sample
-# Standard deviation of the change of the gain per sample, divided by the standard deviation of
-# the gain before the first sample.
+LOAD_MEMORY: Final = 0.998  # expected share of a load disturbance that remains after a sample
+# Standard deviation of the gain's change per sample, divided by the prior standard deviation of
+# the gain.
 GAIN_CHANGE: Final = 0.016
-# Forgetting factor of the filters' log-likelihoods, per sample.
+# Forgetting factor of the log-likelihoods of the Kalman filters, per sample.
 FILTER_FORGETTING: Final = 0.998
-READING_SHARE: Final = 0.1  # share of the noise variance that is noise of the transmitter
+READING_SHARE: Final = 0.1  # share of the noise variance that is measurement noise
 
-# Indices in the state of a filter: the residual v(k), the part of v(k+1) that is carried over
-# from the last sample, the load w(k) and the gain g(k). See `OutputFilter`.
+# Indices of the four elements in the state vector of a Kalman filter: the residual v(k), the
+# carried term a2 v(k-1) + c xi(k) of the next residual v(k+1), the load disturbance w(k) and
+# the gain g(k).
 RESIDUAL, CARRIED, LOAD, GAIN = range(4)
 
 
 class OutputFilter:
-    """Kalman filters of the outputs of n plants, with different assumptions on load and noise.
+    """Kalman filters of n plants, with different assumptions on load disturbance and noise.
 
-    The output is y(k) = g(k) s(k) + v(k), where g is the plant's gain, and s the output of the
-    bank's mean model with gain 1 for the past flows. The residual v is the sum of noise and of
-    the effect of a load disturbance w:
+    The measured output is y(k) = g(k) s(k) + v(k), where g is the plant's gain, s the mean
+    output of the candidate models with gain 1, and v a residual. The residual v is the sum of
+    noise and of the effect of a load disturbance w:
 
         v(k) = a1 v(k-1) + a2 v(k-2) + (1 - a1 - a2) w(k) + xi(k) + c xi(k-1)
         w(k) = LOAD_MEMORY w(k-1) + eta(k)
 
-    The noises xi and eta are white. The coefficients a1 and a2 follow from the poles of the
+    The noises xi and eta are white. The coefficients a1 and a2 follow from the two poles of the
     mean model, and c is the coefficient of z^-1 in the polynomial C of equation (28) of the
-    paper. The gain g changes by a random walk. The state of a filter has four elements: v(k),
-    a2 v(k-1) + c xi(k), w(k) and g(k). The filters differ in the standard deviation of eta and
-    in the variance of xi. The weight of a filter is the likelihood of its one-step errors,
-    which forgets old errors exponentially.
+    paper. The gain g follows a random walk. The state vector of a Kalman filter has the four
+    elements v(k), a2 v(k-1) + c xi(k), w(k) and g(k).
+
+    The Kalman filters differ in the standard deviation of eta and in the variance of xi. The
+    weight of a Kalman filter is the likelihood of its one-step prediction errors, in which old
+    errors are forgotten exponentially.
 
     Parameters
     ----------
     gain_spread
-        Standard deviation of the gain before the first sample, as a share of the step test's
-        gain, shape (n,). The larger `gain_spread`, the faster the gain may change.
+        Prior standard deviation of the gain, divided by the gain that the step test measured,
+        shape (n,). With a larger `gain_spread`, the filters follow faster changes of the gain.
 
     Attributes
     ----------
     gain, gain_spread : ndarray
-        Mean and standard deviation of the gain, as multiples of the step test's gain, shape
-        (n,).
+        Estimated mean and standard deviation of the gain, divided by the gain that the step
+        test measured, shape (n,).
     load : ndarray
-        Mean of the load w, in units of the authority, shape (n,).
+        Estimated mean of the load disturbance w, in units of the steady temperature change for
+        half the flow range, shape (n,).
     innovation : ndarray
-        Newest one-step error of the output, mean over the filters, in units of the authority,
-        shape (n,).
+        Newest one-step prediction error of the output, as a mean over the Kalman filters, in
+        units of the steady temperature change for half the flow range, shape (n,).
     weights : ndarray
-        Probabilities of the filters, shape (filters, n).
+        Probabilities of the Kalman filters, shape (filters, n).
     """
 
     def __init__(self, gain_spread: ArrayLike) -> None:
         spread = np.asarray(gain_spread, np.float64)
         n = len(spread)
         filters = len(LOAD_CHANGES)
-        # At the start, load and residual are known to be 0, and the gain is that of the step
-        # test with an uncertainty.
+        # At the start of an episode, load disturbance and residual are 0. Only the gain is
+        # uncertain. The first axis of the states is the filter, the second the plant, and the
+        # third the element of the state vector.
         self._states = np.zeros((filters, n, 4))
         self._states[:, :, GAIN] = 1.0
         self._covariances = np.zeros((filters, n, 4, 4))
@@ -86,33 +93,36 @@ class OutputFilter:
         self._response = np.zeros(n)
 
     def update(self, output: Array, responses: Array, poles: Array, variances: Array) -> None:
-        """Update all filters with the outputs of a sample; call this method once per sample.
+        """Update the estimates with the measured outputs; call this method once per sample.
 
         Parameters
         ----------
         output
-            Measured outputs y(k), in units of the authority (see `agents.bank`), shape (n,).
+            Measured outputs y(k), in units of the steady temperature change for half the flow
+            range, shape (n,).
         responses
-            Outputs s(k) and s(k-1) of the bank's present mean models with gain 1, shape (2, n).
+            Mean outputs s(k) and s(k-1) of the candidate models with gain 1, with the present
+            probabilities of the models as weights, shape (2, n).
         poles
-            Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
-            (n,).
+            Slow pole exp(-1 / T) of each plant, for the estimated time constant T in samples,
+            shape (n,).
         variances
-            Variances of the bank's one-step errors, in units of the authority squared, shape
-            (n,).
+            Variances of the candidate models' one-step prediction errors, in the squared unit
+            of `output`, shape (n,).
         """
-        # The bank may have changed the mean model since the last sample.
+        # The probabilities of the candidate models may have changed since the previous sample.
         response, last_response = responses
         self._attribute_to_load(last_response - self._response, poles)
         self._response = response
-        # Predict the states of this sample from the states of the last sample.
+        # Predict the states of this sample from the states of the previous sample.
         noises = NOISE_SHARES[:, np.newaxis] * variances
         transition, disturbances = self._matrices(poles, noises)
         states = np.einsum("nij,fnj->fni", transition, self._states)
         covariances = transition @ self._covariances @ transition.transpose(0, 2, 1)
         covariances = covariances + disturbances
-        # Predict the output: the sum of the residual and of gain times response. The cross
-        # covariances are the covariances between the states and the output.
+        # Predict the output, which is the residual plus the gain times the response. The cross
+        # covariances are the covariances between the elements of the state vector and the
+        # output.
         of_gain = response[:, np.newaxis] * covariances[:, :, :, GAIN]
         cross_covariances = covariances[:, :, :, RESIDUAL] + of_gain
         error_variances = (
@@ -120,7 +130,7 @@ class OutputFilter:
         )
         error_variances = error_variances + READING_SHARE * noises
         errors = output - states[:, :, RESIDUAL] - response * states[:, :, GAIN]
-        # Correct the states by the errors of the predicted outputs.
+        # Correct the states by the prediction errors of the outputs.
         corrections = cross_covariances / error_variances[:, :, np.newaxis]
         self._states = states + corrections * errors[:, :, np.newaxis]
         products = corrections[:, :, :, np.newaxis] * cross_covariances[:, :, np.newaxis, :]
@@ -128,38 +138,40 @@ class OutputFilter:
         self._average(errors, error_variances)
 
     def forecast(self, poles: Array, fading: Array) -> Array:
-        """Return forecasts of the residuals v for the time when the present flows show.
+        """Return forecasts of the residuals v, d + 1 samples ahead for the delay d, shape (n,).
 
-        The residual v is the part of the output that the bank's mean model does not explain. In
-        d + 1 samples, for the delay d, the fast part of v decays to 0, and the slow part of v
-        moves from its present value to the load. The load is expected not to change. The
-        forecasts are in units of the authority (see `agents.bank`), shape (n,).
+        The residual v is the part of the output that the mean of the candidate models does not
+        explain. The present flow affects the output after d + 1 samples. In d + 1 samples, the
+        fast part of v decays to 0, and the slow part of v moves towards the load disturbance,
+        which is assumed to be constant. The forecasts are in units of the steady temperature
+        change for half the flow range.
 
         Parameters
         ----------
         poles
-            Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
-            (n,).
+            Slow pole exp(-1 / T) of each plant, for the estimated time constant T in samples,
+            shape (n,).
         fading
-            Share of the distance between the slow part and the load that remains after d + 1
+            Share exp(-(d + 1) / T) of a slowly decaying deviation that remains after d + 1
             samples, shape (n,).
         """
         residual = self._mean_state[RESIDUAL]
         carried = self._mean_state[CARRIED]
-        # The slow part of v, from the partial fractions of the two poles, and its value after a
-        # long time with the present load.
+        # Slow part of v, by partial fractions of the two poles, and the value that the slow
+        # part approaches under a constant load disturbance.
         slow = (poles * residual + carried) / (poles - FAST_POLE)
         slow_of_load = self.load * poles * (1.0 - FAST_POLE) / (poles - FAST_POLE)
         forecasts: Array = self.load + fading * (slow - slow_of_load)
         return forecasts
 
     def _attribute_to_load(self, changes: Array, poles: Array) -> None:
-        """Attribute a change of the mean model's past output to a load, in all states.
+        """Correct the state vectors for changes of s(k-1), the mean model's previous output.
 
-        The probabilities of the bank's models change with time, and then the mean model
-        explains more or less of a past output. The states change as if a constant load
-        explained the difference. `changes` are the changes of s(k-1) in units of the authority,
-        and `poles` the slow poles of the mean models, both of shape (n,).
+        A change of the candidate models' probabilities also changes the part of past outputs
+        that the mean model explains. The state vectors are corrected as if a constant load
+        disturbance explained the change. `changes` are the changes of s(k-1), in units of the
+        steady temperature change for half the flow range, and `poles` are the slow poles exp(-1
+        / T) of the plants, both of shape (n,).
         """
         residuals = -self._states[:, :, GAIN] * changes
         self._states[:, :, RESIDUAL] += residuals
@@ -167,28 +179,16 @@ class OutputFilter:
         self._states[:, :, LOAD] += residuals
 
     def _matrices(self, poles: Array, noises: Array) -> tuple[Array, Array]:
-        """Return the transition matrices and the noise covariances of the filters' states.
+        """Return the transition matrices, (n, 4, 4), and noise covariances, (filters, n, 4, 4).
 
-        Parameters
-        ----------
-        poles
-            Slow poles of the mean models, exp(-1 / T) for a time constant of T samples, shape
-            (n,).
-        noises
-            Noise variances that the filters assume, in units of the authority squared, shape
-            (filters, n).
-
-        Returns
-        -------
-        transition : ndarray
-            State transition matrices, shape (n, 4, 4).
-        covariances : ndarray
-            Covariances of the noise that enters the states, shape (filters, n, 4, 4).
+        `poles` are the slow poles exp(-1 / T) of the plants, shape (n,). `noises` are the noise
+        variances that the Kalman filters assume, in squared units of the steady temperature
+        change for half the flow range, shape (filters, n).
         """
         n = len(poles)
         a1 = poles + FAST_POLE
         a2 = -poles * FAST_POLE
-        # Row i of a transition matrix has the factors from which element i of a state follows.
+        # Row i of a transition matrix has the factors for element i of the state vector.
         transition = np.zeros((n, 4, 4))
         transition[:, RESIDUAL, RESIDUAL] = a1
         transition[:, RESIDUAL, CARRIED] = 1.0
@@ -196,7 +196,7 @@ class OutputFilter:
         transition[:, CARRIED, RESIDUAL] = a2
         transition[:, LOAD, LOAD] = LOAD_MEMORY
         transition[:, GAIN, GAIN] = 1.0
-        # The effects of the noises xi and eta on the elements of a state.
+        # Effects of the white noises xi and eta on the elements of the state vector.
         from_xi = np.array([1.0, NOISE_COLOUR[0], 0.0, 0.0])
         from_eta = np.zeros((n, 4))
         from_eta[:, RESIDUAL] = 1.0 - a1 - a2
@@ -209,10 +209,10 @@ class OutputFilter:
         return transition, covariances
 
     def _average(self, errors: Array, variances: Array) -> None:
-        """Update the probabilities of the filters, and the means over the filters.
+        """Update the probabilities of the Kalman filters, and the means over the filters.
 
-        `errors` are the filters' one-step errors at this sample, in units of the authority, and
-        `variances` the variances that the filters expected, both of shape (filters, n).
+        `errors` are the one-step prediction errors of this sample, and `variances` are the
+        error variances that the Kalman filters expected, both of shape (filters, n).
         """
         losses = np.square(errors) / variances + np.log(variances)
         self._log_likelihoods *= FILTER_FORGETTING

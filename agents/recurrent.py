@@ -1,4 +1,4 @@
-"""Run trained recurrent networks in NumPy alone."""
+"""Compute trained recurrent networks in NumPy, without PyTorch."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ from agents.networks import (
 
 Array = NDArray[np.floating[Any]]
 
-DEFAULT_FILE: Final = PRETRAINED / "neural-10000.npz"  # the network of training seed 10,000
+DEFAULT_FILE: Final = PRETRAINED / "neural-10000.npz"  # trained with the seed 10,000
 
 
 @dataclass(frozen=True)
 class RecurrentNetwork:
     """A gated recurrent unit followed by a hidden layer and an output layer.
 
-    The network corrects the control law of `agents.law`. Each layer after the recurrent unit
-    also receives the network's inputs. Weights and biases are defined as those of
+    The network corrects the control law in `agents.law`. The hidden layer and the output layer
+    also receive the inputs of the network. Weights and biases are defined as in
     `torch.nn.GRUCell` and `torch.nn.Linear`, in float32. The rows of the recurrent unit's
-    arrays belong to the reset gate, then the update gate, then the candidate state. The
-    recurrent unit has `nodes` nodes, and the hidden layer has `hidden` nodes.
+    arrays are ordered by reset gate, update gate and candidate state. In the shapes, `nodes` is
+    the number of nodes of the recurrent unit, and `hidden` the number of nodes of the hidden
+    layer.
     """
 
     input_weights: Array
@@ -42,9 +43,9 @@ class RecurrentNetwork:
     input_biases: Array
     """Biases of the recurrent unit for the inputs, shape (3 nodes,)."""
     state_weights: Array
-    """Weights of the recurrent unit for its last state, shape (3 nodes, nodes)."""
+    """Weights of the recurrent unit for the previous state, shape (3 nodes, nodes)."""
     state_biases: Array
-    """Biases of the recurrent unit for its last state, shape (3 nodes,)."""
+    """Biases of the recurrent unit for the previous state, shape (3 nodes,)."""
     hidden_weights: Array
     """Weights of the hidden layer for inputs and state, shape (hidden, INPUTS + nodes)."""
     hidden_biases: Array
@@ -55,10 +56,10 @@ class RecurrentNetwork:
     output_biases: Array
     """Biases of the output layer, shape (OUTPUTS,)."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    """How the network was trained, for the network's file; JSON-serialisable."""
+    """Description of the training, which `save` writes to the file; JSON-serialisable."""
 
     def __post_init__(self) -> None:
-        """Replace the arrays by float32 copies; raise a ValueError if a shape does not fit."""
+        """Replace the arrays by float32 copies; a wrong shape is a ValueError."""
         nodes = np.shape(self.state_weights)[-1]
         hidden = np.size(self.hidden_biases)
         shapes = {
@@ -77,22 +78,22 @@ class RecurrentNetwork:
 
     @property
     def weights(self) -> dict[str, Array]:
-        """The arrays of weights and biases, by the names of their fields."""
+        """All weights and biases: a dict from field names to arrays."""
         return {name: value for name, value in vars(self).items() if name != "provenance"}
 
     def initial_state(self, n: int) -> Array:
-        """Return the network's state before the first sample of n loops, shape (n, nodes)."""
+        """Return the state of the recurrent unit for n loops at the start, shape (n, nodes)."""
         return np.zeros((n, self.state_weights.shape[1]), np.float32)
 
     def step(self, inputs: Array, state: Array) -> tuple[Array, Array]:
-        """Return the outputs of a sample, shape (n, OUTPUTS), and the next state, (n, nodes).
+        """Return the outputs, shape (n, OUTPUTS), and the next state, shape (n, nodes).
 
         Parameters
         ----------
         inputs
-            Inputs of n loops at this sample, as `agents.law` computes them, shape (n, INPUTS).
+            Inputs of the network for n loops at one sample, shape (n, INPUTS).
         state
-            The state after the last sample, or `initial_state`, shape (n, nodes).
+            State after the previous sample, or from `initial_state`, shape (n, nodes).
         """
         from_inputs = inputs @ self.input_weights.T + self.input_biases
         from_state = state @ self.state_weights.T + self.state_biases
@@ -111,9 +112,9 @@ class RecurrentNetwork:
 
     @classmethod
     def load(cls, path: str | PathLike[str] = DEFAULT_FILE) -> RecurrentNetwork:
-        """Return the network in a file that was written by `save`.
+        """Return the network in an `.npz` file that the method `save` has written.
 
-        A ValueError is raised if the file is damaged or holds something else.
+        A ValueError is raised if the file is damaged or contains no recurrent network.
         """
         with open_arrays(path, "recurrent network") as file:
             settings = read_settings(file)
@@ -122,12 +123,12 @@ class RecurrentNetwork:
             return cls(**weights, provenance=settings["provenance"])
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the network to the `.npz` file `path`, which `load` reads."""
+        """Write the network to the `.npz` file `path`."""
         settings = {"format": FORMAT, "provenance": dict(self.provenance)}
         write_arrays(path, **self.weights, about=json.dumps(settings))
 
 
 def _sigmoid(values: Array) -> Array:
-    """Return 1 / (1 + exp(-x)) for `values` x, in the same shape, without an overflow."""
+    """Return 1 / (1 + exp(-values)), computed without an overflow."""
     activations: Array = 0.5 + 0.5 * np.tanh(0.5 * values)
     return activations

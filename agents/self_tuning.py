@@ -1,4 +1,4 @@
-"""Implement controllers that identify the plant by a bank of models, while they control it."""
+"""Implement controllers that identify the plant during control, by a bank of models."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ from agents.recurrent import RecurrentNetwork
 
 Array = NDArray[np.floating[Any]]
 
-# Time constants of the bank's models, as multiples of the step test's time constant.
+# Time constants of the candidate models, as multiples of the step test's time constant.
 TIME_CONSTANTS: Final = np.array([0.63, 1.0, 1.55])
-# Prior distribution of the delay without the argument `delay_range`: shortest delay, longest
-# delay and standard deviation, as multiples of the step test's delay.
+# Shortest delay, longest delay and standard deviation of the prior distribution of the delay,
+# as multiples of the step test's delay, for controllers without the argument `delay_range`.
 SHORTEST_DELAY: Final = 0.33
 LONGEST_DELAY: Final = 2.0
 DELAY_SPREAD: Final = 0.33
-# Standard deviation of the natural logarithm of the time constant in the prior.
+# Prior standard deviation of the natural logarithm of the time constant.
 CONSTANT_SPREAD: Final = 0.3
-# Standard deviation of the gain in the prior, as a share of the step test's gain.
+# Prior standard deviation of the gain, divided by the step test's gain.
 GAIN_SPREAD: Final = 0.25
-KNOWN_GAIN_SPREAD: Final = 1e-3  # of a gain that counts as known
-# Greatest number of delays in a bank; a bank with more would not fit into the memory.
+KNOWN_GAIN_SPREAD: Final = 1e-3  # for a gain that is assumed to be known
+# Greatest number of candidate delays. More delays would need too much memory.
 MOST_DELAYS: Final = 10_000
-# Distance of the smallest flow from the dead zone, as a share of half the actuator's range:
-# enough for flows that are rounded to float32.
+# Distance of the smallest flow from the dead zone, as a share of half the flow range. This
+# distance keeps a flow out of the dead zone after rounding to float32.
 CLEARANCE: Final = 1e-4
-# Longest time constant, samples, of most plants on which the networks were trained. On a plant
-# with an n times longer time constant, the controller acts at every n-th sample.
+# Longest time constant, in samples, of most plants in the training of the networks. For an n
+# times longer time constant, the controller changes the command at every n-th sample.
 TRAINED_TIME_CONSTANT: Final = 45.0
 
 
 def _time_range(name: str, value: Any) -> tuple[float, float] | None:
-    """Return the shortest and the longest time of the range `value`, s; None for None.
+    """Return the shortest and the longest time in `value`, s, or None if `value` is None.
 
-    A ValueError, which names the argument `name`, is raised unless both times are finite
-    numbers of at least 0, the shortest time first.
+    A ValueError for the argument `name` is raised unless `value` is None or two finite numbers
+    of at least 0, the shortest time first.
     """
     if value is None:
         return None
     try:
         shortest, longest = map(float, value)
     except (TypeError, ValueError):
-        shortest = longest = math.nan  # which is refused below
+        shortest = longest = math.nan  # which is an error below
     if not 0.0 <= shortest <= longest < math.inf:
         raise ValueError(
             f"{name} must be two finite numbers of at least 0, the shortest time first, "
@@ -63,56 +63,56 @@ TimeRange = Annotated[tuple[float, float] | None, _time_range]
 
 
 def _transport_delay(delay: float) -> int:
-    """Return the transport delay d of equation (28) of the paper, samples.
+    """Return the transport delay d of equation (28) of the paper, a whole number of samples.
 
-    `delay` is the time d + 1 from a change of the flow to the first change of a sampled output,
-    in samples. A fraction is rounded.
+    `delay`, in samples, is the time d + 1 from a change of the command to the first sampled
+    output that changes.
     """
     return max(math.floor(delay + 0.5) - 1, 0)
 
 
 @dataclass(eq=False, kw_only=True)
 class SelfTuningController(ModelBasedController):
-    """A predictive controller that identifies the plant while it controls it.
+    """A predictive controller that identifies the plant during control.
 
     The controller has four parts:
 
-    - A bank of models with different delays and time constants runs in parallel with the plant.
-      Each model is weighted by how well it predicts (Magill, "Optimal adaptive estimation of
-      sampled stochastic processes", IEEE Transactions on Automatic Control 10, 1965, 434-439).
-      See `agents.bank`.
-    - Kalman filters estimate the gain of the plant and the load. See `agents.output_filter`.
-    - If the set point is known to change at random, the target for the output lies between the
-      set point and 0, as the set point may change before a flow shows. See `agents.hedge`.
-    - As in a Smith predictor, the mean of the models predicts the effect of flows that have not
-      yet shown in the output, and the next flow moves the predicted output to the target. See
-      `agents.law`.
+    - Candidate models with different delays and time constants run in parallel with the plant
+      (`agents.bank`). A model with small prediction errors has a large weight (Magill, "Optimal
+      adaptive estimation of sampled stochastic processes", IEEE Transactions on Automatic
+      Control 10, 1965, 434-439).
+    - Kalman filters estimate the plant's gain and load disturbance (`agents.output_filter`).
+    - For a set point that changes at random, the target of the output lies between the set
+      point and 0, because the set point may change within the plant's delay (`agents.hedge`).
+    - As in a Smith predictor, the models predict the effect of past flows that have not yet
+      affected the output. The next flow moves the predicted output towards the target
+      (`agents.law`).
 
-    A command is 0 or outside the dead zone, so the flow that passes the actuator is known. All
-    quantities are scaled, so the controller suits plants with a gain of either sign, with any
-    limits and any sampling interval. If the time constant is 90 samples or more, the controller
+    Every command is 0 or outside the dead zone. The controller suits plants with a positive or
+    negative gain, any flow limits and any sampling interval, because all internal quantities
+    are dimensionless. On a plant with a time constant of 90 samples or more, the controller
     changes the command at every second sample or less often.
 
-    The other parameters are those of `ModelBasedController`.
+    All other parameters are described in `ModelBasedController`.
 
     Parameters
     ----------
     dead_zone
-        The greatest half width that the dead zone may have, t/h.
+        Greatest possible half width of the actuator's dead zone, t/h.
     delay_range
-        Shortest and longest delay that the plant may have, s, defined as the argument `delay`.
-        All delays in this range are equally likely. By default, the delay is between a third of
-        `delay` and twice `delay`, and most likely near `delay`.
+        Shortest and longest possible delay of the plant, s, with the definition of the argument
+        `delay`. All delays in `delay_range` are equally likely. If `delay_range` is None, the
+        prior of the delay is a normal distribution around `delay`, from a third of `delay` to
+        twice `delay`.
     setpoint_holds
-        Shortest and longest time, s, for which the set point keeps a random level. All times in
-        this range are equally likely. By default, nothing is known about changes of the set
-        point.
+        Shortest and longest time between two changes of a random set point, s. All times in
+        `setpoint_holds` are equally likely. If `setpoint_holds` is None, the target of the
+        output is the present set point.
     setpoint_amplitude
-        Greatest level of a random set point, degC. The levels are uniformly distributed between
-        `-setpoint_amplitude` and `setpoint_amplitude`. Without `setpoint_holds`, the argument
-        `setpoint_amplitude` has no effect.
+        Amplitude A of a random set point, degC. Random set points are uniformly distributed
+        between -A and A. The amplitude has no effect if `setpoint_holds` is None.
     setpoint_index, error_index
-        Indices of the set point y_d(k) and of the error e(k), both in degC, in the observation.
+        Indices of the set point y_d(k) and the error e(k), both in degC, in an observation.
     """
 
     delay_range: TimeRange = None
@@ -124,23 +124,25 @@ class SelfTuningController(ModelBasedController):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
-        # The controller changes the command less often on a slow plant. Measured in intervals
-        # between changes, the plant then is as fast as those of the networks' training.
+        # On a slow plant, the controller changes the command at every `_samples_held`-th
+        # sample. The time constant, divided by the interval between these samples, is then
+        # similar to the time constants in the training of the networks.
         time_constant = self.time_constant / self.sampling_interval  # samples
         self._samples_held = max(1, int(time_constant / TRAINED_TIME_CONSTANT))
         self._interval = self.sampling_interval * self._samples_held  # s
         self._time_constant = time_constant / self._samples_held  # intervals
-        # The unit of flows, t/h, is negative for a negative gain: a positive scaled flow raises
-        # the temperature. The unit of temperatures, degC, is the authority.
+        # Units of the dimensionless flows, t/h, and temperatures, degC. The unit of flows has
+        # the sign of the gain, so that a positive dimensionless flow raises the temperature.
+        # The unit of temperatures is the steady temperature change for half the flow range.
         self._unit_flow = math.copysign((self.u_max - self.u_min) / 2.0, self.gain)
-        self._authority = self.gain * self._unit_flow
+        self._unit_temperature = self.gain * self._unit_flow
         self._prior = self._prior_of_plant()
         self._random_setpoint = self._setpoint_distribution()
 
     def _prior_of_plant(self) -> Prior:
-        """Return the prior knowledge of one plant: the bank's models and their probabilities.
+        """Return the candidate models of one plant and their prior probabilities.
 
-        A ValueError is raised if the bank would have too many delays.
+        A ValueError is raised if `delay_range` contains too many delays.
         """
         likely = self.delay / self._interval
         if self.delay_range is None:
@@ -149,14 +151,16 @@ class SelfTuningController(ModelBasedController):
             spread = max(DELAY_SPREAD * likely, 1.0)
         else:
             shortest, longest = (time / self._interval for time in self.delay_range)
-            spread = math.inf  # all delays are equally likely
+            spread = math.inf  # which makes all delays equally likely
         first = _transport_delay(shortest)
         delays = np.arange(first, _transport_delay(longest) + 1)
         if len(delays) > MOST_DELAYS:
             raise ValueError(
-                f"delay_range must hold at most {MOST_DELAYS:,} samples, got {len(delays):,}"
+                f"delay_range must cover at most {MOST_DELAYS:,} samples of delay, "
+                f"got {len(delays):,}"
             )
-        # The delay and the logarithm of the time constant are normally distributed.
+        # The prior of the delay, and of the logarithm of the time constant, is a normal
+        # distribution.
         delay_logarithms = -0.5 * np.square((delays + 1.0 - likely) / spread)
         constant_logarithms = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
         logarithms = delay_logarithms[:, np.newaxis] + constant_logarithms
@@ -170,22 +174,24 @@ class SelfTuningController(ModelBasedController):
     def _setpoint_distribution(self) -> RandomSetpoint | None:
         """Return the distribution of random set points; None if `setpoint_holds` is None.
 
-        Times are in intervals between changes of the command, and the amplitude is in units of
-        the authority (see `agents.bank`).
+        Times are divided by the interval between changes of the command, and the amplitude is
+        in units of the steady temperature change for half the flow range.
         """
         if self.setpoint_holds is None:
             return None
         shortest, longest = (
             time / self.sampling_interval / self._samples_held for time in self.setpoint_holds
         )
-        return RandomSetpoint(shortest, longest, self.setpoint_amplitude / self._authority)
+        amplitude = self.setpoint_amplitude / self._unit_temperature
+        return RandomSetpoint(shortest, longest, amplitude)
 
     @property
     def estimates(self) -> dict[str, Array]:
-        """The present estimates of the plants' parameters by name, each of shape (batch,).
+        """Present estimates of the plants' parameters, a dict of arrays of shape (batch,).
 
-        The names are `gain` (degC per t/h), `time_constant` (s) and `delay` (s, defined as the
-        argument `delay`). Before the first observation of an episode, the dict is empty.
+        The keys of the dict are `gain` (degC per t/h), `time_constant` (s) and `delay` (s, with
+        the definition of the argument `delay`). Before the first observation of an episode, the
+        dict is empty.
         """
         if self._k == 0:
             return {}
@@ -196,15 +202,12 @@ class SelfTuningController(ModelBasedController):
         }
 
     def reset(self) -> None:
-        """Forget past samples and the identified plant, as the next plant may be different."""
+        """Forget past samples and estimates, as the next plant may be different."""
         super().reset()
         self._k = 0
 
     def _start(self, n: int) -> None:
-        """Make the bank, the observer and the control law for n plants at rest.
-
-        `_control` calls this method at the first sample of an episode.
-        """
+        """Create the estimators and the control law for n plants at the start of an episode."""
         edge = 0.0
         if self.dead_zone > 0.0:
             edge = self.dead_zone / abs(self._unit_flow) + CLEARANCE
@@ -214,20 +217,19 @@ class SelfTuningController(ModelBasedController):
         self._bank = Bank(self._prior.repeated(n))
         self._observer = Observer(self._bank, edges, limits, self._random_setpoint)
         self._law = Law(self._bank, edges, limits)
-        # Function that computes corrections of the control law; None for no corrections.
+        # Function that computes the corrections of the control law; None for no corrections.
         self._corrections: Network | None = None
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the commands u(k), t/h, shape (loops,), and update the identified models.
+        """Return the commands u(k), t/h, shape (loops,), and update the estimates.
 
-        `rows` are the observations, shape (loops, size). If the plant is slow, most calls
-        repeat the last command.
+        On a slow plant, most calls return the commands of the previous call.
         """
         if self._k == 0:
             self._start(len(rows))
         if self._k % self._samples_held == 0:
-            setpoint = rows[:, self.setpoint_index] / self._authority
-            output = setpoint - rows[:, self.error_index] / self._authority
+            setpoint = rows[:, self.setpoint_index] / self._unit_temperature
+            output = setpoint - rows[:, self.error_index] / self._unit_temperature
             situation = self._observer.observe(
                 setpoint.astype(np.float32), output.astype(np.float32)
             )
@@ -243,20 +245,22 @@ class SelfTuningController(ModelBasedController):
 class NeuralSelfTuningController(SelfTuningController):
     """A self-tuning controller whose control law is corrected by a trained recurrent network.
 
-    The network was trained in advance, on many simulated plants, and does not learn online. The
+    The network was trained in advance on many simulated plants, and does not learn online. The
     network is computed in float32, so the command for a loop can differ by rounding between a
-    batch and a single loop. The other parameters are those of `SelfTuningController`.
+    batch and a single loop.
+
+    All other parameters are described in `SelfTuningController`.
 
     Parameters
     ----------
     network
-        The trained network; by default the network in the folder `agents/pretrained`.
+        Trained network; by default, the network in the folder `agents/pretrained`.
     """
 
     network: RecurrentNetwork = field(default_factory=RecurrentNetwork.load, repr=False)
 
     def _start(self, n: int) -> None:
-        """Make bank, observer, control law and the network's state for n plants at rest."""
+        """Create the estimators, the control law and the network's state for n plants."""
         super()._start(n)
         self._state = self.network.initial_state(n)
         self._corrections = self._next_outputs
@@ -264,8 +268,7 @@ class NeuralSelfTuningController(SelfTuningController):
     def _next_outputs(self, inputs: Array) -> Array:
         """Return the network's outputs, shape (n, OUTPUTS), and store the network's next state.
 
-        `inputs` are the inputs of a sample, shape (n, INPUTS). Call this method once per
-        sample.
+        `inputs` are the inputs of the network at one sample, shape (n, INPUTS).
         """
         outputs, self._state = self.network.step(inputs, self._state)
         return outputs
@@ -273,17 +276,17 @@ class NeuralSelfTuningController(SelfTuningController):
 
 @dataclass(eq=False, kw_only=True)
 class NeuralSmithPredictor(NeuralSelfTuningController):
-    """A neural controller that trusts a step test, and does not identify the plant.
+    """A neural controller that relies on a step test, and does not identify the plant.
 
-    The controller is a `NeuralSelfTuningController` whose bank has a single model, that of the
-    step test, and whose gain counts as known. The parameters are those of
-    `NeuralSelfTuningController`, without `delay_range`.
+    The controller is a `NeuralSelfTuningController` whose only candidate model is the model
+    from the step test, with a fixed gain. All parameters except `delay_range` are described in
+    `NeuralSelfTuningController`.
     """
 
     delay_range: None = field(init=False, default=None)
 
     def _prior_of_plant(self) -> Prior:
-        """Return the prior knowledge of a plant: its only model is that of the step test."""
+        """Return a prior whose only candidate model is the model from the step test."""
         return Prior(
             time_constants=[[self._time_constant]],
             shortest_delays=[_transport_delay(self.delay / self._interval)],

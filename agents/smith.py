@@ -1,4 +1,4 @@
-"""Implement a Smith predictor: a PI controller on the error that a model predicts."""
+"""Implement a Smith predictor, which applies a PI controller to a predicted error."""
 
 from __future__ import annotations
 
@@ -17,32 +17,33 @@ Array = NDArray[np.float64]
 
 @dataclass(eq=False, kw_only=True)
 class SmithPredictor(InternalModelController):
-    """A PI controller on the error that an undelayed model of the plant predicts.
+    """A Smith predictor: a PI controller whose input is a predicted error.
 
-    A first-order model with a delay runs in parallel with the plant. The model's undelayed
-    output minus the model's delayed output is the effect of flows that have not yet shown in
-    the plant's output. The PI controller acts on the error minus the effect of these flows. If
-    the model is right, the PI controller acts as if the plant had no delay (Smith, "Closer
-    control of loops with dead time", Chemical Engineering Progress 53, 1957, 217-219).
+    A first-order model with a delay runs in parallel with the plant. The effect of past flows
+    that have not yet affected the plant's output is the model's undelayed output minus the
+    model's delayed output. The input of the PI controller is the error minus the effect of
+    these past flows. If the model equals the plant, the PI controller acts as if the plant had
+    no delay (Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53,
+    1957, 217-219).
 
-    The gains `kp` and `ki` follow from the SIMC rule for the plant without delay (see
-    `PIController.simc`). The input of the model is the flow that the actuator passes. A command
-    inside the dead zone is moved to 0 or to the edge of the dead zone, whichever is nearer.
+    The gains `kp` and `ki` follow from `PIController.simc`, the SIMC rule, for the plant
+    without delay. The input of the model is the flow that leaves the actuator. A command inside
+    the dead zone is moved to 0 or to the edge of the dead zone, whichever is nearer.
 
-    To prevent windup, the integral part of the command follows the wanted flow, limited to the
-    actuator's range, with the time constant of the integral action (Astrom and Hagglund, "PID
-    Controllers", 2nd edition, 1995, section 3.5). As long as no limit of the flow is active,
-    the controller with anti-windup equals an ordinary PI controller. While the wanted flow is
-    inside the dead zone, the controller goes on integrating.
+    To prevent windup, the integral part of the command follows the wanted flow, clipped to the
+    flow limits, with the time constant of the integral action (Astrom and Hagglund, "PID
+    Controllers", 2nd edition, 1995, section 3.5). While the wanted flow is within the flow
+    limits, the anti-windup has no effect. While the wanted flow is inside the dead zone, the PI
+    controller continues to integrate.
 
-    The other parameters are those of `ModelBasedController`.
+    All other parameters are described in `ModelBasedController`.
 
     Parameters
     ----------
     closed_loop_time_constant
-        Time constant that the closed loop would have if the plant had no delay, s.
+        Time constant of the closed loop for the plant without delay, s.
     error_index
-        Index of the error e(k), degC, in the observation.
+        Index of the error e(k), degC, in an observation.
 
     Attributes
     ----------
@@ -76,19 +77,19 @@ class SmithPredictor(InternalModelController):
     def transfer(self) -> tuple[Array, Array]:
         """Return the transfer function from the error e to the command u, t/h per degC.
 
-        The Smith predictor is linear while the command is between the limits of the flow and
-        outside the dead zone. The predictor is the PI controller with a feedback from u: the
-        undelayed model minus the delayed model.
+        The transfer function is valid while the command is within the flow limits and outside
+        the dead zone. The feedback around the PI controller is the undelayed model minus the
+        delayed model.
 
         Returns
         -------
         numerator, denominator
-            Coefficients of z^0, z^-1 and so on.
+            Coefficients of z^0, z^-1, z^-2 and so on, as arrays.
         """
         pi_numerator, pi_denominator = PIController(self.kp, self.ki).transfer()
         model_numerator = np.array([0.0, self._input_gain])
         model_denominator = np.array([1.0, -self._pole])
-        # The undelayed minus the delayed model is the model times 1 - z^-(delay - 1).
+        # The undelayed minus the delayed model is the undelayed model times 1 - z^-(delay - 1).
         in_transit = np.zeros(self._delay)
         in_transit[0] += 1.0
         in_transit[-1] -= 1.0
@@ -97,15 +98,12 @@ class SmithPredictor(InternalModelController):
         return np.convolve(pi_numerator, model_denominator), polyadd(forward, feedback)
 
     def _control(self, rows: Array) -> Array:
-        """Return the commands u(k), t/h, shape (loops,), and advance the model by a sample.
-
-        `rows` are the observations, shape (loops, size).
-        """
+        """Return the commands u(k), t/h, shape (loops,), and update the model's state."""
         in_transit = self._undelayed - self._delayed
         error = rows[:, self.error_index] - in_transit
-        gain = self.kp + self.ki  # of the present error, which the sum of errors includes
+        gain = self.kp + self.ki  # factor of the present error, which is also in the sum
         wanted = self._integral - gain * error
-        # Anti-windup: the integral follows the limited flow, and not the wanted flow.
+        # For anti-windup, the integral follows the clipped flow instead of the wanted flow.
         limited = np.clip(wanted, self.u_min, self.u_max)
         self._integral = self._integral + self.ki / gain * (limited - self._integral)
         return self._command(wanted)

@@ -196,7 +196,7 @@ def test_some_controllers_refuse_more_plants():
     network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
     network.check_environment(Parameters(**network.observation), "", 5)
     other = Parameters(**network.observation | {"output_window": 3})
-    with pytest.raises(ValueError, match="windows that policy wants"):
+    with pytest.raises(ValueError, match="observations that policy expects"):
         network.check_environment(other, "", 5)
 
 
@@ -299,7 +299,7 @@ def test_simc_by_hand():
     # By default tau_c = theta: 100 / (2 x 20) = 2.5; tau_I = 4 x 20, less than 100.
     controller = PIController.simc(**plant, delay=10.0)
     assert (controller.kp, controller.ki) == pytest.approx((2.5, 2.5 * 8 / 80))
-    with pytest.raises(ValueError, match="must be given where delay is 0"):
+    with pytest.raises(ValueError, match="must be given if delay is 0"):
         PIController.simc(**plant, delay=0.0)
 
 
