@@ -1,7 +1,8 @@
-"""Model the plant: its arguments, its dynamics and the signals that reach it.
+"""Model the plant: the arguments, the dynamics and the external signals.
 
 - `parameters` declares every argument of the environment, and `checks` checks single values.
-- `sampling` samples the plant numbers of an episode from its own random numbers.
+- `sampling` samples the parameter values of a plant for each episode.
 - `signals` generates set points, noise and loads.
-- `dynamics` steps plants and valves; `state` describes a plant to a teacher in training.
+- `dynamics` simulates plants and actuators.
+- `state` returns quantities of plants that a policy cannot observe, for use in training.
 """
