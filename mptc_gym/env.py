@@ -52,11 +52,7 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
 
 
 class HasJsonSpec:
-    """An environment whose specification (`EnvSpec`) can be written as JSON.
-
-    The specification holds lists and Python numbers in place of NumPy arrays and NumPy numbers,
-    which JSON cannot store.
-    """
+    """An environment whose specification (`EnvSpec`) can be written as JSON."""
 
     _spec: EnvSpec | None = None
 
@@ -99,17 +95,18 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     the commanded and u_a the applied feedwater flow (t/h), n the noise (degC), xi the white
     noise that causes n, and d the delay (samples). Call k of `step` (k = 0, 1, ...) applies the
     flow u(k), moves the plant from sample k to k+1, and returns the observation at k+1 and the
-    reward of the error e(k+1). With d = 18, the first temperature that depends on the flow u(0)
-    is y(19). With polynomials A, B and C in the backward shift z^-1, equation (28) reads
-    A(z^-1) y(k) = B(z^-1) u_a(k-d) + C(z^-1) xi(k).
+    reward of the error e(k+1). With a delay of d = 18 samples, y(19) is the first temperature
+    that depends on the flow u(0). With polynomials A, B and C in the backward shift z^-1,
+    equation (28) reads A(z^-1) y(k) = B(z^-1) u_a(k-d) + C(z^-1) xi(k).
 
-    Section 1 of the paper names further difficulties of a boiler that equation (28) does not
-    include. The following difficulties are switched off by default, and switched on in some of
-    the argument sets in `mptc_gym.PRESETS`:
+    Section 1 of the paper names difficulties of a boiler that equation (28) does not include.
+    The environment can simulate the following difficulties, which are off by default, and on in
+    some of the argument sets in `mptc_gym.PRESETS`:
 
     - Measurement noise: from sample k = 1 on, the observation holds the transmitter's reading
       y + v in place of the temperature y, with white noise v ~ N(0,
       measurement_noise_variance). The reward and `info["output"]` use the true temperature y.
+
     - A load disturbance w (degC), as when the feedwater's temperature, the coal or the fire's
       position changes: A(1) w(k) is added to the right side of equation (28), so that a
       constant load w adds w to the steady-state temperature. The load w starts at 0 and changes
@@ -117,12 +114,14 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
       variance of the random walk grows by `disturbance_walk_variance` per sample. The level of
       the load jumps at random times, every `disturbance_interval` samples on average, to a new
       level that is uniform within +-`disturbance_amplitude`.
+
     - Other dynamics: `gain_factor` multiplies the steady-state gain, and `time_constant_factor`
       multiplies the dominant time constant. The polynomial A is (1 - p z^-1) Q(z^-1), where
       p = 0.9515 is the slowest pole of equation (28), and the dominant time constant is
       1 / (1 - p) = 20.6 samples. A gain factor g and a time constant factor t replace the
       slowest pole p by 1 - (1 - p) / t, multiply the polynomial B by g / t, and leave the
       polynomial Q unchanged.
+
     - Fouling: within `drift_samples` samples, the gain drifts linearly to `gain_drift` times
       the gain at k = 0, and the time constant to `time_constant_drift` times the time constant
       at k = 0. A drifting gain or time constant changes every 10 samples.
@@ -141,10 +140,10 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
 
     ## Observation space
 
-    The observation is a 1-D float32 array that joins a block of set points, a block of errors,
-    a block of outputs and a block of past actions, each with the newest sample first. In the
-    table of the observation, y is the transmitter's reading of the temperature, which saturates
-    at +-`temperature_span`, and e is y_d minus this reading.
+    The observation is a 1-D float32 array that joins four blocks: set points, errors, outputs
+    and past actions, each block with the newest sample first. In the table of the four blocks,
+    y is the transmitter's reading of the temperature, which saturates at +-`temperature_span`,
+    and e is y_d minus this reading.
 
     | Block | Elements (default) | Bounds (default) | Unit |
     |---|---|---|---|
@@ -155,10 +154,10 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
 
     The default observation holds three set points and three errors, the six inputs of the
     paper's neural network. Past actions in the observation are clipped to +-1, because the
-    actuator limits the flow that an action beyond +-1 commands. With `action_window=delay+2`,
-    the problem without noise is a Markov decision process as long as the set point stays
-    constant. If the set point can exceed +-`temperature_span`, the bounds of set points and
-    errors in the observation space are wide enough to include the set point.
+    actuator limits the flow that an action beyond +-1 commands. With `action_window=delay+2`
+    and without noise, the control problem is a Markov decision process as long as the set point
+    stays constant. If the set point can exceed +-`temperature_span`, the bounds of set points
+    and errors in the observation space are wide enough to include the set point.
 
     ## Reward
 
@@ -354,7 +353,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         ResetNeeded
             If `step` is called before the first `reset`.
         """
-        # The speed of the environment depends on this method, so it avoids function calls.
+        # The speed of the environment depends on `step`, which therefore avoids function calls.
         try:
             a = float(action.item() - 0.0)  # subtracting 0.0 fails for text such as "0.3"
         except NOT_A_NUMBER:

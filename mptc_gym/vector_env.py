@@ -52,7 +52,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         the caller resets each plant whose episode has ended, with `reset(options={"reset_mask":
         mask})`.
     render_mode
-        Render mode: None, or "rgb_array" for a method `render` that returns pictures.
+        Render mode: None, or "rgb_array", with which `render` returns one picture per plant.
     **arguments
         The arguments of `MiddlePointEnv`. All plants have the same arguments; if an argument is
         a range, each reset of a plant samples a number for this plant.
@@ -112,8 +112,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._plants = PlantBatch(parameters, num_envs)
         self._window = _Window(parameters.windows, num_envs)
         self._actions = np.zeros(num_envs)  # the actions of the last step
-        # In comparisons, an array of full length is faster than a number; in other arithmetic,
-        # an array of one number is faster.
+        # In comparisons, an array of shape (num_envs,) is faster than a Python number. In other
+        # arithmetic, an array of shape () is faster than a Python number.
         self._zeros = np.zeros(num_envs)
         self._all_true = np.ones(num_envs, np.bool_)
         self._all_false = np.zeros(num_envs, np.bool_)
@@ -153,8 +153,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
         `a` holds the checked normalised actions, shape (num_envs,).
         """
-        # The speed of the environment depends on this method. With few plants, the number of
-        # NumPy calls in this method counts.
+        # The speed of the environment depends on `_advance`. With few plants, the number of
+        # NumPy calls in `_advance` determines the speed.
         signals = self._signals
         setpoint = signals.setpoint.next()
         noise = self._zeros
@@ -262,11 +262,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _final_observations(
         self, ended: Mask, observations: Observations
     ) -> NDArray[np.object_]:
-        """Return the rows of observations of the plants in `ended`, and None for other plants.
-
-        `observations` has the shape (num_envs, size). The returned array of objects has the
-        shape (num_envs,).
-        """
+        """Return the rows of `observations` for the plants `ended`, and None for others."""
         final_observations = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(ended):
             final_observations[i] = observations[i].copy()
@@ -286,8 +282,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Restart the random number streams of the plants in `mask`, each from its own seed.
 
-        `seed` is the argument of `reset`. The streams of a plant without a seed continue; at
-        the first reset, the streams of this plant start from a random seed.
+        The streams of a plant without a seed continue; at the first reset, the streams of this
+        plant start from a random seed.
         """
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():
@@ -318,24 +314,21 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return list(seeds)
 
     def _checked_actions(self, actions: Any) -> Values:
-        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended.
-
-        A ValueError is raised unless `actions` holds finite numbers of shape (num_envs, 1).
-        """
+        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended."""
         return many_actions(actions, self.num_envs, self._ended)
 
 
 class _Window:
     """The latest observations of n plants, stored so that a new sample needs little copying.
 
-    An observation joins a block of set points, a block of errors, a block of outputs and a
-    block of past actions, each with the newest sample first. `windows` holds the numbers of
-    samples in these four blocks.
+    An observation joins four blocks: set points, errors, outputs and past actions, each block
+    with the newest sample first. `windows` holds the numbers of set points, errors, outputs and
+    past actions in an observation.
 
     One 1-D array holds the observations of all plants, one observation after the other. At each
-    step, the index at which the first observation begins decreases by 1. All samples then lie
-    one element later in their observation, without any copying, and the new sample replaces the
-    first element of each block.
+    step, the index at which the first observation begins decreases by 1. Without any copying,
+    each old sample then lies one element later in the observation of its plant, and the new
+    sample replaces the first element of each block.
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
@@ -363,7 +356,7 @@ class _Window:
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
         """Set the observations of plants at rest at sample k = 0, for the plants `which`.
 
-        `setpoint` holds the set points y_d(0) of these plants, degC, shape (len(which),).
+        `setpoint` holds the set points y_d(0) of the plants `which`, degC, shape (len(which),).
         `rest_action` holds the actions that command 0 t/h, shape (len(which),), or shape () for
         one action for all plants.
         """
@@ -380,10 +373,10 @@ class _Window:
     def add(
         self, setpoint: Values, error: Values, output: Values, action: Values
     ) -> Observations:
-        """Add the newest sample of all plants, and return a copy of the observations.
+        """Add a sample of all plants, and return a copy of the observations, shape (n, size).
 
         The sample consists of set points y_d(k+1), observed errors and outputs, all in degC,
-        and normalised actions a(k), each of shape (n,). The copy has the shape (n, size).
+        and normalised actions a(k), each of shape (n,).
         """
         if self._place == 0:  # no element of the row is left before the first observation
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]

@@ -56,7 +56,7 @@ def shorten(value: object) -> str:
 
 
 def one_action(action: Any) -> float:
-    """Return the action of one plant as a float.
+    """Return the checked action of one plant as a float.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def one_action(action: Any) -> float:
 def many_actions(
     actions: Any, num_envs: int, ignored: NDArray[np.bool_] | None
 ) -> NDArray[np.float64]:
-    """Return the actions of many plants in a new array, shape (num_envs,).
+    """Return the checked actions of many plants in a new array, shape (num_envs,).
 
     Parameters
     ----------
@@ -90,8 +90,8 @@ def many_actions(
     num_envs
         Number of plants.
     ignored
-        Mask of the plants whose actions are ignored, shape (num_envs,), or None for no plant.
-        An ignored action may be infinite or NaN, and becomes 0.
+        Mask of the plants whose actions are ignored and become 0, shape (num_envs,), or None
+        for no plant. An ignored action may be infinite or NaN.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def many_actions(
 
 
 def _as_float64(values: Any) -> NDArray[np.float64] | None:
-    """Return an array, list or tensor as a new float64 array; None if not all are numbers."""
+    """Return `values` as a new float64 array, or None if an element is not a number."""
     try:
         array = np.asarray(values)
         if array.dtype.hasobject:
@@ -177,8 +177,8 @@ def numbers(
 ) -> tuple[float, ...]:
     """Return an argument's value, a list or tuple of 1 to `most` numbers, as a tuple of floats.
 
-    A ValueError with the text `allowed` is raised if `value` is not such a list or tuple, or if
-    a number in `value` is not within +-1e9.
+    A ValueError with the text `allowed` is raised unless `value` is a list or tuple of 1 to
+    `most` numbers within +-1e9.
     """
     if not isinstance(value, list | tuple) or not 0 < len(value) <= most:
         reject(name, value, allowed)
@@ -229,8 +229,9 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
 def number_or_range(check: Callable[[str, Any], float], name: str, value: Any) -> Number:
     """Return the value of an argument: one number, or a range (low, high) of two numbers.
 
-    `check` is the check of a single number. A ValueError is raised if `value` is neither a
-    number that passes `check`, nor a list or tuple of two such numbers, the lower number first.
+    `check` is a function that checks an argument that is one number. A ValueError is raised if
+    `value` is neither a number that passes `check`, nor a list or tuple of two such numbers,
+    the lower number first.
     """
     if not isinstance(value, list | tuple):
         return check(name, value)

@@ -10,8 +10,8 @@ the actuator by equation (29)::
     (28)  A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k)
     (29)  u_a = 0 where |u| < dead_zone, otherwise u limited to [u_min, u_max]
 
-Here, y is the temperature, u the commanded flow, u_a the applied flow, d the delay in samples
-and xi white noise.
+In equations (28) and (29), y is the temperature, u the commanded flow, u_a the applied flow, d
+the delay in samples and xi white noise.
 """
 
 from collections import deque
@@ -124,7 +124,8 @@ class Dynamics:
         self._drift_samples = parameters.drift_samples
         self._negated_a = [-coefficient for coefficient in parameters.a[1:]]
         self._sum_of_a = sum(parameters.a)  # A(1)
-        # The coefficients of Q from z^0 on, and a 0; empty if the time constant never changes.
+        # The coefficients of Q from z^0 on, followed by 0. The list is empty if the time
+        # constant never changes.
         self._quotient: list[float] = []
         if parameters.changes_time_constant:
             pole = slowest_pole(parameters.a).real  # a real one, as Parameters has checked
@@ -136,8 +137,8 @@ class Dynamics:
         """Return the share of the drift of gain and time constant that is complete.
 
         The complete share of a drift grows linearly from 0 at sample k = 0 to 1 at sample k =
-        `drift_samples`, and is 1 afterwards. `age` is the present sample k. `age` and the
-        result are numbers, or arrays or tensors with one element per plant.
+        `drift_samples`, and is 1 afterwards. `age` is the present sample k: a number, or an
+        array or tensor with one element per plant. The returned share has the shape of `age`.
         """
         share = age / self._drift_samples
         return share * (share < 1.0) + (share >= 1.0)  # at most 1, for arrays of any library
@@ -152,7 +153,7 @@ class Dynamics:
         Parameters
         ----------
         numbers
-            Parameter values of the plants, with the factors at k = 0 and the drifts.
+            Parameter values of the plants, such as `gain_factor` and `gain_drift`.
         age
             Number of samples since the start of the episode: a number, or an array or tensor
             with one element per plant.
@@ -214,8 +215,8 @@ class Plant:
     Attributes
     ----------
     factors : dict of float
-        Values of "gain_factor" and "time_constant_factor" at the present sample: multiples of
-        the gain and of the time constant of the polynomials A and B. The dict is empty if
+        Values of "gain_factor" and "time_constant_factor" at the present sample, as multiples
+        of the gain and of the time constant of the polynomials A and B. `factors` is empty if
         neither gain nor time constant drifts.
     """
 
@@ -299,7 +300,7 @@ class Plant:
 
 
 class PlantBatch:
-    """A simulation of n plants and actuators in NumPy arrays, with the results of `Plant`.
+    """n plants with actuators in NumPy arrays, with the same results as n objects `Plant`.
 
     Parameters
     ----------
@@ -314,8 +315,8 @@ class PlantBatch:
         Parameter values of the plants in the present episodes: float64 arrays, of shape (n,)
         for the arguments that are ranges, and of shape () for all other arguments.
     factors : dict of ndarray of float64
-        Values of "gain_factor" and "time_constant_factor" at the present sample, shape (n,):
-        multiples of the gain and of the time constant of the polynomials A and B. The dict is
+        Values of "gain_factor" and "time_constant_factor" at the present sample, shape (n,), as
+        multiples of the gain and of the time constant of the polynomials A and B. `factors` is
         empty if neither gain nor time constant drifts.
     """
 
@@ -347,8 +348,9 @@ class PlantBatch:
     def reset(self, plants: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
         """Bring the plants with the indices `plants` to rest, and set the parameter values.
 
-        `numbers` holds the parameter values of these plants: arrays of shape (len(plants),) for
-        the arguments that are ranges, and of shape () for all other arguments.
+        `numbers` holds the parameter values of the plants `plants`: arrays of shape
+        (len(plants),) for the arguments that are ranges, and of shape () for all other
+        arguments.
         """
         for outputs in self._outputs:
             outputs[plants] = 0.0
@@ -410,7 +412,7 @@ class PlantBatch:
         return command, applied, output
 
     def _update_actuator(self) -> None:
-        """Recompute the actuator values for `step` after a change of limits or dead zones."""
+        """Update the limits and dead zones of `step` after the parameter values change."""
         u_min = self.numbers.u_min
         u_max = self.numbers.u_max
         self._half_range = np.array((u_max - u_min) / 2.0)
@@ -443,9 +445,9 @@ class _InputResponse:
     of the next s samples. The responses to a block of s + 1 successive flows are therefore
     computed at once, after the last flow of the block, and then returned sample by sample.
 
-    The array `_flows` has one row per sample, the oldest sample first. The last s + 1 rows of
-    `_flows` are the block of flows that `add` fills. The rows above this block hold older
-    flows, which B and delays longer than s need.
+    The array `_flows` has one row of applied flows per sample, the oldest sample first. The
+    last rows of `_flows` are the block of flows that `add` fills. The first rows of `_flows`
+    hold older flows, which the polynomial B and the longer delays need.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
@@ -471,8 +473,8 @@ class _InputResponse:
     def reset(self, plants: NDArray[np.intp], delays: Values) -> None:
         """Begin an episode of the plants with the indices `plants`, with past flows of 0 t/h.
 
-        `delays` holds the delays of these plants in samples, shape (len(plants),), or shape ()
-        for one delay of all plants.
+        `delays` holds the delays of the plants `plants` in samples, shape (len(plants),), or
+        shape () for one delay of all plants.
         """
         self._flows[:, plants] = 0.0
         self._response[:, plants] = 0.0
@@ -484,9 +486,9 @@ class _InputResponse:
     def add(self, applied: Values) -> Values:
         """Add the applied flows u_a(k), and return the response B(z^-1) u_a(k+1-d), degC.
 
-        `applied` holds the flows u_a(k) of the plants in t/h, shape (n,). The response is a
-        part of the temperatures y(k+1), shape (n,). The caller must not modify the returned
-        array.
+        `applied` holds the flows u_a(k) of the plants in t/h, shape (n,). The returned response
+        to the flows is a part of the temperatures y(k+1), shape (n,). The caller must not
+        modify the returned array.
         """
         self._flows[self._older_rows + self._next_row] = applied
         self._next_row += 1

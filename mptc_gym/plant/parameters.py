@@ -34,13 +34,14 @@ def _argument(default: Any, check: checks.Check, unit: str, meaning: str) -> Any
 class PlantNumbers(Generic[Value]):
     """The arguments of a plant that can differ from episode to episode, such as the delay.
 
-    In the arguments of the environment, each field is one number, or a range [low, high] from
-    which each reset of the environment samples one number. During an episode, each field is a
-    float for one plant, or an array or tensor for many plants.
+    In the arguments of the environment, each field of `PlantNumbers` is one number, or a range
+    [low, high] from which each reset of the environment samples one number. During an episode,
+    each field of `PlantNumbers` is a float for one plant, or an array or tensor for many
+    plants.
 
-    If field i of the dataclass is a range, a reset computes the value of field i from random
-    number i of the episode. The order of the fields must therefore never change, and a new
-    field must come last: otherwise the same seed would give another plant.
+    If field i of `PlantNumbers` is a range, a reset computes the value of field i from random
+    number i of the episode. The order of the fields of `PlantNumbers` must therefore never
+    change, and a new field must come last: otherwise the same seed would give another plant.
     """
 
     delay: Value = _argument(
@@ -246,8 +247,8 @@ class Parameters(PlantNumbers[Number]):
         Raises
         ------
         TypeError
-            If the environment has no argument of a given name. The message of the error
-            suggests a similar name of an argument, if possible.
+            If the name of an argument is unknown. The message of the error suggests a similar
+            name of an argument, if possible.
         ValueError
             If the value of an argument is not allowed.
         """
@@ -340,7 +341,7 @@ class Parameters(PlantNumbers[Number]):
 
     @cached_property
     def changes_time_constant(self) -> bool:
-        """Whether the plant's time constant can ever differ from the time constant of `a`."""
+        """Whether the plant's time constant can differ from the one that `a` gives."""
         return self._can_differ(1.0, "time_constant_factor", "time_constant_drift")
 
     @cached_property

@@ -30,7 +30,7 @@ class EpisodeStream:
     """A stream of random numbers in which every episode has its own starting point.
 
     Episode j begins j * 2**64 random numbers into the stream, however many random numbers the
-    earlier episodes have used. The j-th episode after a seed therefore always gets the same
+    earlier episodes have used. The j-th episode after a seed therefore always has the same
     random numbers.
 
     The random number generator is created at the first episode, because many plants have

@@ -8,8 +8,8 @@ per plant. In an environment with one plant, `ahead` returns the values of a sig
 Signals draw many random numbers at a time, because one call of a random number generator is
 much faster than many calls and returns the same random numbers.
 
-The symbols in formulas are the set point y_d(k), the temperature y(k), the coloured noise n(k)
-= C(z^-1) xi(k) with white noise xi, all as in the paper, and the load disturbance w(k).
+Formulas use the symbols of the paper: set point y_d(k), temperature y(k), and coloured noise
+n(k) = C(z^-1) xi(k) with white noise xi. The load disturbance w(k) is not in the paper.
 """
 
 from __future__ import annotations
@@ -89,12 +89,7 @@ class Noise:
     def reset(
         self, plants: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
     ) -> None:
-        """Begin an episode of the plants with the indices `plants`.
-
-        `streams` holds the random number streams of all plants. `numbers` holds the parameter
-        values of the plants that begin an episode, of which only the variance of the noise is
-        used.
-        """
+        """Begin an episode of the plants with the indices `plants`."""
         deviations = np.sqrt(getattr(numbers, f"{self._name}_variance"))
         self._scaled_c[:, plants] = deviations[..., np.newaxis] * self._c
         self._past_xi[plants] = 0.0
@@ -201,11 +196,6 @@ class _HeldSignal(ABC):
 
     Times of changes are counted in samples since the plants were created.
 
-    Parameters
-    ----------
-    num_envs
-        Number n of plants.
-
     Attributes
     ----------
     present : ndarray of float64
@@ -259,11 +249,7 @@ class SetPoint(_HeldSignal):
         self._places = np.zeros(num_envs, np.intp)
 
     def reset(self, plants: Indices, streams: StreamsOfPlants) -> Values:
-        """Begin an episode of the plants with the indices `plants`.
-
-        The result holds the set points y_d(0) of the plants that begin an episode, degC, shape
-        (len(plants),). `streams` holds the random number streams of all plants.
-        """
+        """Begin an episode of the plants `plants`, and return the set points y_d(0), degC."""
         self._streams = streams
         if self._levels.random:
             for i in plants.tolist():
@@ -340,10 +326,8 @@ class Disturbance(_HeldSignal):
     ) -> None:
         """Begin an episode of the plants with the indices `plants`, at load 0.
 
-        `numbers` holds the parameter values of the plants that begin an episode, and `streams`
-        the random number streams of all plants. The caller must already have sampled the
-        parameter values of these plants, because the load uses the random numbers that follow
-        in the stream `plant`.
+        Before this call, the parameter values of the plants must have been sampled, because the
+        load uses the random numbers that follow in the stream `plant` of each plant.
         """
         self._streams = streams
         self._amplitudes[plants] = numbers.disturbance_amplitude
@@ -394,7 +378,7 @@ class Disturbance(_HeldSignal):
     def _continue_walks(self, plants: Indices, uniform: Values) -> Values:
         """Return the random walks of some plants at the next changes of the load, degC.
 
-        `uniform` holds random numbers from 0 to 1. `uniform` and the result have the shape
+        `uniform`, which holds random numbers from 0 to 1, and the result have the shape
         (len(plants), number of changes).
         """
         steps = (2.0 * uniform - 1.0) * self._largest_walk_steps[plants, np.newaxis]
@@ -406,11 +390,11 @@ class Disturbance(_HeldSignal):
     def _continue_levels(
         self, plants: Indices, jump_uniform: Values, level_uniform: Values
     ) -> Values:
-        """Return the levels of some plants at the next changes of the load, degC.
+        """Return the load levels of some plants at the next changes of the load, degC.
 
         `jump_uniform` holds random numbers from 0 to 1 that decide whether the level jumps, and
-        `level_uniform` random numbers from 0 to 1 that decide the new level. Both arrays and
-        the result have the shape (len(plants), number of changes).
+        `level_uniform` random numbers from 0 to 1 that decide the new level. `jump_uniform`,
+        `level_uniform` and the result have the shape (len(plants), number of changes).
         """
         jumps = jump_uniform < self._jump_probabilities[plants, np.newaxis]
         new_levels = (2.0 * level_uniform - 1.0) * self._amplitudes[plants, np.newaxis]
@@ -425,7 +409,7 @@ class Disturbance(_HeldSignal):
 
 
 class Signals(NamedTuple):
-    """The external signals of some plants; None stands for a signal that is always 0."""
+    """The external signals of n plants; a field is None if the signal is always 0."""
 
     setpoint: SetPoint
     noise: Noise | None

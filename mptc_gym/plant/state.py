@@ -60,10 +60,7 @@ def plant_state(
 
 
 def _nominal_gain(parameters: Parameters) -> float:
-    """Return the steady-state gain B(1) / A(1), degC per t/h, or infinity if A(1) is 0.
-
-    A and B are the polynomials of the plant, equation (28) of the paper.
-    """
+    """Return the steady-state gain of `a` and `b`, degC per t/h; infinity if A(1) is 0."""
     denominator = sum(parameters.a)
     return sum(parameters.b) / denominator if denominator else math.inf
 
