@@ -273,7 +273,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return values.copy()
 
     def _hidden_state(self) -> tuple[dict[str, Values], Values]:
-        """Return the parameter values sampled from ranges, by name, and the load w, degC."""
+        """Return the parameter values sampled from ranges, by name, and the loads, degC."""
         load = self._zeros
         if self._signals.disturbance is not None:
             load = self._signals.disturbance.present
@@ -354,7 +354,7 @@ class _Window:
         return self._row[self._place : self._place + self._elements].reshape(self._shape)
 
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
-        """Set the observations of plants at rest at sample k = 0, for the plants `which`.
+        """Set the observations of the plants `which` at sample k = 0, with the plants at rest.
 
         `setpoint` holds the set points y_d(0) of the plants `which`, degC, shape (len(which),).
         `rest_action` holds the actions that command 0 t/h, shape (len(which),), or shape () for

@@ -124,7 +124,7 @@ def _as_float64(values: Any) -> NDArray[np.float64] | None:
 def to_python(value: Any) -> Any:
     """Return `value` with NumPy arrays and numbers converted to lists and Python numbers.
 
-    NumPy values inside a list or tuple are converted as well.
+    The conversion includes NumPy values inside a list or tuple.
     """
     if isinstance(value, list | tuple):
         return type(value)(map(to_python, value))

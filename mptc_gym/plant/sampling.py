@@ -113,8 +113,8 @@ class PlantSampler:
 
     From a range of floats, values are sampled uniformly from [low, high), and from a range of
     integers, uniformly from low to high, both included. Every field of `PlantNumbers` has its
-    own random number, whether the field is a range or not. Turning another field into a range
-    therefore does not change the values that a seed gives for the existing ranges.
+    own random number, whether the field is a range or not. If another field becomes a range, a
+    seed therefore still gives the same values for the fields that were already ranges.
 
     Parameters
     ----------

@@ -114,7 +114,7 @@ class Noise:
         return noise
 
     def ahead(self) -> list[float]:
-        """Return the noise of a single plant for the next block of successive samples, degC."""
+        """Return the noise of a single plant at the next `len(self._block)` samples, degC."""
         self._fill(ONLY_PLANT, 0)
         noise: list[float] = self._block[:, 0].tolist()
         return noise

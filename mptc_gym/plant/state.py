@@ -60,7 +60,7 @@ def plant_state(
 
 
 def _nominal_gain(parameters: Parameters) -> float:
-    """Return the steady-state gain of `a` and `b`, degC per t/h; infinity if A(1) is 0."""
+    """Return the steady-state gain of the polynomials `a` and `b`, degC per t/h, or inf."""
     denominator = sum(parameters.a)
     return sum(parameters.b) / denominator if denominator else math.inf
 
