@@ -6,7 +6,8 @@
 
 Importing this package registers the ids `MiddlePoint-v0`, `MiddlePointDeadZone7-v0`,
 `MiddlePointNoisy-v0`, `MiddlePointDisturbed-v0`, `MiddlePointFouling-v0`,
-`MiddlePointRandomised-v0` and `MiddlePointHard-v0`; see `PRESETS`. `evaluate` scores a policy.
+`MiddlePointRandomised-v0` and `MiddlePointHard-v0`. `PRESETS` holds the arguments of the
+registered environments. `evaluate` scores a policy.
 """
 
 import gymnasium

@@ -1,4 +1,4 @@
-"""Simulate one plant, its set point and its transmitter: the environment `MiddlePoint-v0`."""
+"""Simulate the plant, set point and transmitter of one boiler: `MiddlePoint-v0`."""
 
 from __future__ import annotations
 
@@ -34,10 +34,11 @@ Action = NDArray[np.float32]
 
 
 def observation_space(parameters: Parameters) -> Space[Observation]:
-    """Return the space of an observation, a float32 `Box` of shape (size,).
+    """Return the observation space of an environment, a float32 `Box` of shape (size,).
 
-    The bounds depend on the set point only if the set point exceeds the transmitter's range, so
-    that a policy that was trained on one set point can run on another set point.
+    The bounds of observations depend on the set point only if the set point can exceed
+    +-`temperature_span`, so that a policy that was trained on one set point can run on another
+    set point.
     """
     span = parameters.temperature_span
     setpoints = parameters.setpoint
@@ -51,10 +52,7 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
 
 
 class HasJsonSpec:
-    """An environment whose specification (`EnvSpec`) can be written as JSON.
-
-    JSON has no NumPy arrays and numbers: the specification holds lists and Python numbers.
-    """
+    """An environment whose specification (`EnvSpec`) can be written as JSON."""
 
     _spec: EnvSpec | None = None
 
@@ -65,7 +63,7 @@ class HasJsonSpec:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        """Store a copy of an `EnvSpec`, with lists and Python numbers in place of NumPy's."""
+        """Store a copy of `spec`, with NumPy values converted to lists and Python numbers."""
         if spec is not None:
             spec = copy(spec)
             spec.kwargs = {name: to_python(value) for name, value in spec.kwargs.items()}
@@ -76,12 +74,13 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     """Control the temperature at the middle point of a once-through boiler by feedwater flow.
 
     At the middle point of a once-through boiler, water becomes steam. More feedwater lowers the
-    temperature there, but only after a transport delay of 18 samples of 8 s; the actuator has a
-    dead zone and saturates; noise disturbs the temperature. The plant is that of X. Cui and
-    K. G. Shin, "Application of neural networks to temperature control in thermal power plants"
-    (1992), here called the paper; numbers in parentheses, such as (28), are equations of this
-    paper. All temperatures and flows are deviations from the operating point.
-    `MiddlePointVectorEnv` runs many such plants at once.
+    temperature at the middle point, but only after a transport delay of 18 samples of 8 s. The
+    actuator of the feedwater flow has a dead zone and saturates, and noise disturbs the
+    temperature. The plant comes from Cui and Shin, "Application of neural networks to
+    temperature control in thermal power plants" (1992), here called the paper. Numbers in
+    parentheses, such as (28), are equations of the paper. All temperatures and flows are
+    deviations from the boiler's operating point. `MiddlePointVectorEnv` simulates many plants
+    at once.
 
     ## Plant
 
@@ -96,50 +95,55 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     the commanded and u_a the applied feedwater flow (t/h), n the noise (degC), xi the white
     noise that causes n, and d the delay (samples). Call k of `step` (k = 0, 1, ...) applies the
     flow u(k), moves the plant from sample k to k+1, and returns the observation at k+1 and the
-    reward of the error e(k+1). With d = 18, the flow u(0) first shows in y(19). Equation
-    (28) is also written as A(z^-1) y(k) = B(z^-1) u_a(k-d) + C(z^-1) xi(k), with polynomials A,
-    B and C.
+    reward of the error e(k+1). With a delay of d = 18 samples, y(19) is the first temperature
+    that depends on the flow u(0). With polynomials A, B and C in the backward shift z^-1,
+    equation (28) reads A(z^-1) y(k) = B(z^-1) u_a(k-d) + C(z^-1) xi(k).
 
-    Section 1 of the paper names further difficulties of a boiler that equation (28) does not
-    include. The following difficulties are off by default, and on in some of the argument sets
-    in `mptc_gym.PRESETS`:
+    Section 1 of the paper names difficulties of a boiler that equation (28) does not include.
+    The environment can simulate the following difficulties, which are off by default, and on in
+    some of the argument sets in `mptc_gym.PRESETS`:
 
-    - Measurement noise: from k = 1 on, the observation shows the reading y + v in place of the
-      temperature y, with white noise v ~ N(0, measurement_noise_variance). The reward and
-      `info["output"]` use the true temperature y.
+    - Measurement noise: from sample k = 1 on, the observation holds the transmitter's reading
+      y + v in place of the temperature y, with white noise v ~ N(0,
+      measurement_noise_variance). The reward and `info["output"]` use the true temperature y.
+
     - A load disturbance w (degC), as when the feedwater's temperature, the coal or the fire's
       position changes: A(1) w(k) is added to the right side of equation (28), so that a
-      constant load w adds w to the temperature in the steady state. The load starts at 0 and
-      changes every 10 samples. The load is the sum of two parts: a random walk that gains a
-      variance of `disturbance_walk_variance` per sample, and steps at random times, every
-      `disturbance_interval` samples on average, to random levels uniform within
-      +-`disturbance_amplitude`.
-    - Other dynamics: `gain_factor` times the steady-state gain, `time_constant_factor` times
-      the dominant time constant. With p = 0.9515 the slowest pole of equation (28), the
-      polynomial A is (1 - p z^-1) Q(z^-1), and the time constant is 1 / (1 - p) = 20.6 samples.
-      To multiply the time constant by t and the gain by g, the slowest pole p moves so that
-      1 - p is divided by t, and the polynomial B is multiplied by g / t; the polynomial Q stays.
-    - Fouling: in `drift_samples` samples, gain and time constant drift linearly to `gain_drift`
-      and `time_constant_drift` times the gain and the time constant at k = 0. The drifting
-      values change every 10 samples.
+      constant load w adds w to the steady-state temperature. The load w starts at 0 and changes
+      every 10 samples. The load w is the sum of a random walk and of a level that jumps. The
+      variance of the random walk grows by `disturbance_walk_variance` per sample. The level of
+      the load jumps at random times, every `disturbance_interval` samples on average, to a new
+      level that is uniform within +-`disturbance_amplitude`.
+
+    - Other dynamics: `gain_factor` multiplies the steady-state gain, and `time_constant_factor`
+      multiplies the dominant time constant. The polynomial A is (1 - p z^-1) Q(z^-1), where
+      p = 0.9515 is the slowest pole of equation (28), and the dominant time constant is
+      1 / (1 - p) = 20.6 samples. A gain factor g and a time constant factor t replace the
+      slowest pole p by 1 - (1 - p) / t, multiply the polynomial B by g / t, and leave the
+      polynomial Q unchanged.
+
+    - Fouling: within `drift_samples` samples, the gain drifts linearly to `gain_drift` times
+      the gain at k = 0, and the time constant to `time_constant_drift` times the time constant
+      at k = 0. A drifting gain or time constant changes every 10 samples.
 
     ## Action space
 
-    `Box(-1, 1, (1,), float32)`: an action a commands the flow
+    The action space is `Box(-1, 1, (1,), float32)`: an action a commands the flow
     u = u_min + (a + 1) / 2 * (u_max - u_min), in t/h.
 
     | Index | Action | at -1 | at 1 | Unit |
     |---|---|---|---|---|
     | 0 | feedwater flow u | u_min = -10 | u_max = 10 | t/h |
 
-    An action below -1 or above 1 commands a flow outside the range from `u_min` to `u_max`,
-    which the actuator limits to this range.
+    An action below -1 or above 1 commands a flow outside the range from `u_min` to `u_max`; the
+    actuator limits the applied flow to this range.
 
     ## Observation space
 
-    The observation is a 1-D float32 array that joins four blocks, each with the newest sample
-    first. In this table, y is the transmitter's reading of the temperature, which saturates at
-    +-`temperature_span`, and e is y_d minus this reading.
+    The observation is a 1-D float32 array that joins four blocks: set points, errors, outputs
+    and past actions, each block with the newest sample first. In the table of the four blocks,
+    y is the transmitter's reading of the temperature, which saturates at +-`temperature_span`,
+    and e is y_d minus this reading.
 
     | Block | Elements (default) | Bounds (default) | Unit |
     |---|---|---|---|
@@ -148,11 +152,12 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     | outputs y(k), y(k-1), ... | `output_window` (0) | +-50 | degC |
     | actions a(k-1), a(k-2), ... | `action_window` (0) | +-1 | 1 |
 
-    The default observation is the six inputs of the paper's neural network. Past actions are
-    clipped to +-1, as the actuator limits the commands of actions beyond +-1. With
-    `action_window=delay+2`, the problem without noise is a Markov decision process as long as
-    the set point stays constant. If the set point can exceed the transmitter's range, the
-    bounds of set points and errors widen to include the set point.
+    The default observation holds three set points and three errors, the six inputs of the
+    paper's neural network. Past actions in the observation are clipped to +-1, because the
+    actuator limits the flow that an action beyond +-1 commands. With `action_window=delay+2`
+    and without noise, the control problem is a Markov decision process as long as the set point
+    stays constant. If the set point can exceed +-`temperature_span`, the bounds of set points
+    and errors in the observation space are wide enough to include the set point.
 
     ## Reward
 
@@ -161,19 +166,20 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     | "quadratic" | -(e(k+1) / error_scale)^2 / 2 - move_weight * abs(a(k) - a(k-1)) |
     | "absolute" | -abs(e(k+1)) / error_scale - move_weight * abs(a(k) - a(k-1)) |
 
-    The reward "quadratic" is the negative of the cost in equation (12) of the paper, for the
-    error divided by `error_scale`.
-    The best possible reward of a step is 0. With the default set point, a plant whose feedwater
-    flow stays 0 earns -0.5 per step. The reward has no lower bound, since e is the error of the
-    true temperature, which the transmitter's range does not limit.
+    If `move_weight` is 0, the reward "quadratic" is the negative of the cost in equation (12)
+    of the paper, applied to the error divided by `error_scale`. The best possible reward of a
+    step is 0. With the default arguments and a constant feedwater flow of 0 t/h, the reward of
+    every step is -0.5. The reward has no lower bound, because the error in the reward is the
+    set point minus the true temperature, which the transmitter's range does not limit.
 
     ## Starting state
 
-    Before sample k = 0, the plant has been at rest: temperature y, set point y_d, error e,
-    flows u and u_a, and white noise xi are all 0, so that y(0) = 0. All random numbers come
-    from the seed, in separate streams, so that every controller meets the same noise, set
-    point, load and plant. The j-th episode after a seed does not depend on the length of
-    earlier episodes. `reset` has no options.
+    The plant is at rest before sample k = 0: temperature y, set point y_d, error e, flows u and
+    u_a, and white noise xi are all 0, so that y(0) = 0. All random numbers come from the seed
+    of `reset`. The random numbers do not depend on the actions, so that every controller meets
+    the same noise, set point, load and plant for the same seed. The random numbers of the j-th
+    episode after a seed do not depend on the length of earlier episodes. `reset` has no
+    options.
 
     ## Episode end
 
@@ -181,27 +187,29 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
 
     ## Arguments
 
-    All arguments are keyword-only and can be given to `gymnasium.make`. An asterisk marks an
-    argument that can be a range [low, high], from which each `reset` samples a number uniformly
-    (an integer where the default is an integer).
+    All arguments are keyword-only and can be given to `gymnasium.make`. In the table of
+    arguments, an asterisk marks an argument that can be a range [low, high], from which each
+    `reset` samples a number uniformly (an integer where the default is an integer).
 
     <arguments>
 
-    `render_mode` is None, "human" or "rgb_array"; see Rendering. In place of lists, arguments
-    may be tuples or NumPy arrays. Numbers must be within +-1e9, the delay and each window may
-    have at most 10,000 samples, and `a`, `b` and `c` at most 1,000 coefficients each.
+    `render_mode` is None, "human" or "rgb_array"; the section on rendering describes these
+    modes. An argument that is a list may also be a tuple or a NumPy array. Every number in an
+    argument must be within +-1e9. The delay and each window of the observation may have at most
+    10,000 samples, and the polynomials `a`, `b` and `c` at most 1,000 coefficients each.
 
     ## Info
 
     `reset` and `step` return a new dict of floats: `output` (the true y, degC), `setpoint`
     (y_d, degC), `error` (y_d - y, degC), `command` (u, t/h), `applied` (u_a, t/h) and `noise`
-    (n, degC). The step from sample k to k+1 returns the flows u(k) and u_a(k), and y(k+1),
-    y_d(k+1), e(k+1) and n(k+1). At reset, `command`, `applied` and `noise` are 0.
+    (n, degC). The info of the step from sample k to k+1 holds the flows u(k) and u_a(k), and
+    y(k+1), y_d(k+1), e(k+1) and n(k+1). In the info of `reset`, `command`, `applied` and
+    `noise` are 0.
 
-    With a load disturbance, the info also holds `disturbance` (w, degC). With a drift, the info
-    also holds the present `gain_factor` and `time_constant_factor`. The info of `reset` also
-    holds the number that was sampled for each argument that is a range, under the argument's
-    name; a delay is an int.
+    With a load disturbance, the info also holds `disturbance`, the load w in degC. With a drift
+    of gain or time constant, the info also holds the values of `gain_factor` and
+    `time_constant_factor` at the present sample. For each argument that is a range, the info of
+    `reset` also holds the sampled number, under the argument's name; a sampled delay is an int.
 
     ## Rendering
 
@@ -210,10 +218,11 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     | "rgb_array" | returns a picture, shape (540, 960, 3), uint8 |
     | "human" | shows the picture in a window; `reset` and `step` call `render`, at most `metadata["render_fps"]` times a second |
 
-    A picture shows the latest 200 samples, or more if the delay is long. The upper panel shows
-    set point and true temperature. The lower panel shows commanded and applied flow, the dead
-    zone, the limits, and the time in which the flow is still in transit to the middle point.
-    Pictures need pygame: `pip install "mptc_gym[render]"`. Gymnasium's `RecordVideo` also needs
+    The picture shows the latest 200 samples of the episode, or more if the delay is long. The
+    upper panel of the picture shows the set point and the true temperature. The lower panel of
+    the picture shows the commanded and the applied flow, the dead zone and the limits of the
+    flow, and the latest samples, whose flow has not reached the middle point yet. `render`
+    needs pygame: `pip install "mptc_gym[render]"`. Gymnasium's `RecordVideo` also needs
     moviepy.
 
     ## Errors
@@ -250,11 +259,12 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         self._has_more_info = parameters.is_disturbed or parameters.drifts
         self._plant_sampler = PlantSampler(parameters)
         self._signals = Signals.of(parameters)
-        # Random number streams of the only plant; empty before the first reset.
+        # Random number streams of the environment's plant; empty before the first reset.
         self._streams: list[RandomStreams] = []
-        self._root: np.random.Generator | None = None  # whose seed the streams come from
-        # Set point y_d, noise n, load w and measurement noise, degC, of the samples to come,
-        # the next sample last.
+        # The random number generator from whose seed the streams start.
+        self._root: np.random.Generator | None = None
+        # Set point y_d, noise n, load w and measurement noise, degC, of the coming samples,
+        # with the next sample at the end of the list.
         self._coming_signals: list[tuple[float, ...]] = []
 
     # Only `Parameters` lists all arguments, so help() and editors need this signature.
@@ -268,17 +278,19 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         Parameters
         ----------
         seed
-            Seed from which the environment's random number streams restart. Without a seed, the
-            streams move to their next episode.
+            Seed with which the environment's random number streams restart. If the seed is
+            None, the random number streams continue with the random numbers of the next
+            episode.
         options
             Not used.
 
         Returns
         -------
         observation : ndarray of float32
-            The observation at sample k = 0, shape (size,), laid out as in the class docstring.
+            The observation at sample k = 0, shape (size,); the docstring of the class describes
+            the elements.
         info : dict of float
-            The info at sample k = 0, and the numbers that were sampled for ranges.
+            The info at sample k = 0, with the numbers that `reset` sampled from ranges.
         """
         super().reset(seed=seed)
         if self._root is not self.np_random:  # at the first reset, or after a new seed
@@ -316,7 +328,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         return np.fromiter(self._window, _FLOAT32, size), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
-        """Move the plant by one sample, with a normalised action.
+        """Apply a normalised action, and move the plant from sample k to sample k+1.
 
         Parameters
         ----------
@@ -328,20 +340,20 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         observation : ndarray of float32
             The observation at sample k+1, shape (size,).
         reward : float
-            The reward of the error e(k+1).
+            The reward of the step from sample k to sample k+1.
         terminated, truncated : bool
-            Always False: `gymnasium.make` adds the time limit.
+            Always False, because no episode terminates; `gymnasium.make` adds the time limit.
         info : dict of float
             The info at sample k+1.
 
         Raises
         ------
         ValueError
-            If the action is not one finite number. The error leaves the plant unchanged.
+            If the action is not one finite number; the plant is then left unchanged.
         ResetNeeded
             If `step` is called before the first `reset`.
         """
-        # The speed of the environment depends on this method, so it avoids function calls.
+        # The speed of the environment depends on `step`, which therefore avoids function calls.
         try:
             a = float(action.item() - 0.0)  # subtracting 0.0 fails for text such as "0.3"
         except NOT_A_NUMBER:
@@ -402,14 +414,14 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         return observation, reward, False, False, info
 
     def render(self) -> Frame | None:
-        """Return a picture of the latest samples of the episode, or show it in a window.
+        """Return or show a picture of the latest samples of the episode.
 
         Returns
         -------
         ndarray of uint8 or None
-            With the render mode "rgb_array", a picture, shape (540, 960, 3). With "human",
-            None: the picture is shown in a window. Without a render mode, None, after a
-            warning.
+            A picture, shape (540, 960, 3), in the render mode "rgb_array". None in the render
+            mode "human", which shows the picture in a window. None after a warning, if the
+            environment has no render mode.
 
         Raises
         ------
@@ -431,7 +443,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         return None
 
     def close(self) -> None:
-        """Close the window, unless another environment still shows pictures in the window."""
+        """Close the picture window, unless another environment still uses the window."""
         if self.render_mode == "human" and self._record is not None:
             from mptc_gym.environments import drawing  # which needs pygame
 
@@ -443,5 +455,5 @@ MiddlePointEnv.__doc__ = insert_table(MiddlePointEnv.__doc__)
 
 
 def _clip(value: float, limit: float) -> float:
-    """Return a value clipped to +-`limit`; NaN becomes the upper limit."""
+    """Return `value` limited to the range from -`limit` to `limit`; NaN becomes `limit`."""
     return max(-limit, min(limit, value))

@@ -1,9 +1,9 @@
-"""Define presets of the environment's arguments, from the paper's three cases to a hard one."""
+"""Define presets of the environment's arguments: the paper's 3 cases and 4 harder ones."""
 
 from typing import Any, Final
 
-# A boiler in operation, with two noises, and a load disturbance that steps and wanders. The
-# variances are in degC^2, the amplitude in degC and the interval in samples.
+# A boiler with plant noise, measurement noise, and a load disturbance with jumps and a random
+# walk. The variances are in degC^2, the amplitude in degC and the interval in samples.
 _BOILER: Final[dict[str, Any]] = {
     "noise_variance": 0.5,
     "measurement_noise_variance": 0.1,
@@ -37,12 +37,12 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
         "setpoint": "random",
     },
 }
-"""The arguments of the environment in each preset, by its name.
+"""The arguments of the environment in each preset, by name of the preset.
 
 "paper", "dead-zone-7" and "noisy" are the three cases of the paper. "disturbed" adds
 measurement noise and a load disturbance to "noisy". "fouling" adds drifts of gain and time
-constant to "disturbed". "randomised" draws the plant and the variance of its noise at each
-reset. "hard" combines the disturbances, drifts and random plants with random set points.
+constant to "disturbed". "randomised" samples the plant and the variance of the plant's noise at
+each reset. "hard" combines the disturbances, drifts and random plants with random set points.
 """
 
 IDS: Final[dict[str, str]] = {

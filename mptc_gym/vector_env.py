@@ -25,57 +25,60 @@ from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 
 NOISE_BYTES = 1 << 27  # most bytes for a block of noise: 128 MiB
-# Steps after which all observations are moved in memory: so rarely that the moves take little
-# time. The memory for them is one element a step.
+# Number of steps after which all observations are moved in memory, so rarely that the moves
+# take little time. The moves need memory for one more element per step.
 STEPS_PER_SHIFT = 64
 
 
 class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects the bases
     """n plants that advance together: `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
 
-    With the same seed, `reset` and `step` of `MiddlePointVectorEnv` and of Gymnasium's
-    `SyncVectorEnv` of n `MiddlePointEnv` return the same, bit for bit. See `MiddlePointEnv` for
-    the plant, the spaces, the reward, the infos and the arguments.
+    For the same seed, `reset` and `step` of `MiddlePointVectorEnv` return the same results, bit
+    for bit, as `reset` and `step` of Gymnasium's `SyncVectorEnv` with n `MiddlePointEnv`. The
+    docstring of `MiddlePointEnv` describes the plant, the spaces, the reward, the infos and the
+    arguments.
 
     Parameters
     ----------
     num_envs
         Number n of plants, at most 10 million.
     max_episode_steps
-        Samples after which an episode is truncated; None or -1 for no limit.
+        Number of samples after which an episode is truncated; None or -1 for no limit.
     autoreset_mode
-        An `AutoresetMode` or its value. "NextStep": the step after the end of an episode resets
-        the plant, and ignores the plant's action. "SameStep": the step that ends an episode
-        also resets the plant; `final_obs` and `final_info` in the infos hold the last
-        observation and info of the episode. "Disabled": the caller resets plants whose episode
-        has ended, with `reset(options={"reset_mask": mask})`.
+        An `AutoresetMode` or the value of an `AutoresetMode`, as a string. "NextStep": the step
+        after the end of an episode resets the plant, and ignores the action for this plant.
+        "SameStep": the step that ends an episode also resets the plant; `final_obs` and
+        `final_info` in the infos hold the last observation and info of the episode. "Disabled":
+        the caller resets each plant whose episode has ended, with `reset(options={"reset_mask":
+        mask})`.
     render_mode
-        None, or "rgb_array": `render` returns a picture of each plant.
+        Render mode: None, or "rgb_array", with which `render` returns one picture per plant.
     **arguments
-        The arguments of `MiddlePointEnv`. All plants have the same arguments, but where an
-        argument is a range, every plant draws its own number.
+        The arguments of `MiddlePointEnv`. All plants have the same arguments; if an argument is
+        a range, each reset of a plant samples a number for this plant.
 
     Raises
     ------
     ValueError
-        If an argument is out of range; the message names the argument.
+        If the value of an argument is not allowed; the message of the error names the argument.
     TypeError
         If an argument is unknown.
 
     Notes
     -----
     `reset(seed=seed)` restarts the random number streams of plant i with seed + i, or with
-    element i of the seed if the seed is a list. Without a seed, or where the list holds None,
-    the next episode of the plant's present streams begins. Rewards are float64, and
-    observations float32.
+    element i of the seed if the seed is a list. The streams of a plant without a seed, or with
+    the seed None, continue with the next episode. Rewards are float64, and observations
+    float32.
 
-    A step is array arithmetic alone, except where every plant draws from its own random number
-    generators: at the start of an episode, once every 600 samples or so of noise, and when a
-    random set point changes. The memory that a plant needs, a few KiB, does not grow with the
+    A step uses array arithmetic only, except when each plant draws random numbers from a
+    separate generator: at the start of an episode, about every 600 samples of noise, and when a
+    random set point changes. The memory for one plant is a few KiB, and does not grow with the
     length of an episode.
 
-    With an unstable `a`, or with actions beyond 1e154, the temperature may overflow, of which
-    NumPy warns; `MiddlePointEnv` gives no warning.
+    With an unstable polynomial `a`, or with actions beyond +-1e154, the temperature may
+    overflow. NumPy warns of an overflow in `MiddlePointVectorEnv`; `MiddlePointEnv` gives no
+    warning.
     """
 
     metadata: dict[str, Any] = MiddlePointEnv.metadata | {"render_modes": ["rgb_array"]}
@@ -90,13 +93,12 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
-        """Prepare the plants; the docstring of the class describes the arguments."""
         one_of("render_mode", render_mode, [None, "rgb_array"])
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
         parameters = self.parameters
         self.render_mode = render_mode
-        # Random number streams and, if pictures are wanted, records of episodes, by the index
-        # of the plant. Both dicts are empty before the first reset.
+        # Random number streams and, if pictures are wanted, records of episodes, by index of
+        # the plant. Both dicts are empty before the first reset.
         self._streams: dict[int, RandomStreams] = {}
         self._records: dict[int, Record] = {}
         self._seeds: list[int | None] = [None] * num_envs
@@ -110,8 +112,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._plants = PlantBatch(parameters, num_envs)
         self._window = _Window(parameters.windows, num_envs)
         self._actions = np.zeros(num_envs)  # the actions of the last step
-        # In comparisons, an array of full length is faster than a number; in other arithmetic,
-        # an array of one number is faster.
+        # In comparisons, an array of shape (num_envs,) is faster than a Python number. In other
+        # arithmetic, an array of shape () is faster than a Python number.
         self._zeros = np.zeros(num_envs)
         self._all_true = np.ones(num_envs, np.bool_)
         self._all_false = np.zeros(num_envs, np.bool_)
@@ -126,9 +128,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return tuple(self._seeds)
 
     def render(self) -> tuple[Frame, ...] | None:
-        """Return a picture of each plant, uint8, shape (540, 960, 3): rows, columns, RGB.
+        """Return one picture per plant, uint8, of shape (540, 960, 3): rows, columns, RGB.
 
-        Without a render mode, the result is None, after a warning.
+        Without a render mode, `render` warns and returns None.
 
         Raises
         ------
@@ -147,12 +149,12 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return tuple(map(drawing.frame, self._records.values()))
 
     def _advance(self, a: Values) -> tuple[Observations, Values, Mask, Mask, Infos]:
-        """Move all plants by one sample, and return what `step` returns if no episode ends.
+        """Move all plants by one sample, and return the results of a step that ends no episode.
 
-        `a` are the checked actions, shape (num_envs,).
+        `a` holds the checked normalised actions, shape (num_envs,).
         """
-        # The speed of the environment depends on this method. With few plants, the number of
-        # NumPy calls in this method counts.
+        # The speed of the environment depends on `_advance`. With few plants, the number of
+        # NumPy calls in `_advance` determines the speed.
         signals = self._signals
         setpoint = signals.setpoint.next()
         noise = self._zeros
@@ -215,8 +217,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _readings(self, output: Values) -> Values:
         """Return the transmitter's readings of the temperatures `output`, degC, shape (n,).
 
-        Readings have noise and saturate at +-`temperature_span`. Without noise and saturation,
-        the result is the array `output` itself.
+        A reading is the temperature plus measurement noise, limited to +-`temperature_span`.
+        Without measurement noise and saturation, the method returns the array `output` itself.
         """
         reading = output
         if self._signals.measurement_noise is not None:
@@ -232,8 +234,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
         """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
 
-        Infos that are always 0 at k = 0 are left out. The infos are arrays of shape
-        (num_envs,), in which elements of other plants have no meaning.
+        The returned dict leaves out infos that are always 0 at sample k = 0. Each info is an
+        array of shape (num_envs,), in which the elements of plants outside `mask` have no
+        meaning.
         """
         which = np.flatnonzero(mask)  # the indices of the plants
         numbers = self._plant_sampler.sample([self._streams[i] for i in which.tolist()])
@@ -259,22 +262,18 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _final_observations(
         self, ended: Mask, observations: Observations
     ) -> NDArray[np.object_]:
-        """Return the rows of observations of the plants in `ended`, and None for other plants.
-
-        `observations` has the shape (num_envs, size), and the array of objects that is returned
-        the shape (num_envs,).
-        """
+        """Return the rows of `observations` for the plants `ended`, and None for others."""
         final_observations = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(ended):
             final_observations[i] = observations[i].copy()
         return final_observations
 
     def _as_array(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return a copy of an array of shape (num_envs,)."""
+        """Return a copy of the array `values`, shape (num_envs,)."""
         return values.copy()
 
     def _hidden_state(self) -> tuple[dict[str, Values], Values]:
-        """Return the drawn plant numbers by name, and the load w, degC, for `plant_state`."""
+        """Return the parameter values sampled from ranges, by name, and the loads, degC."""
         load = self._zeros
         if self._signals.disturbance is not None:
             load = self._signals.disturbance.present
@@ -283,8 +282,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Restart the random number streams of the plants in `mask`, each from its own seed.
 
-        `seed` is the argument of `reset`. The streams of plants without a seed continue, or
-        start from a random seed at the first reset.
+        The streams of a plant without a seed continue; at the first reset, the streams of this
+        plant start from a random seed.
         """
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():
@@ -298,8 +297,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _checked_seeds(self, seed: Any) -> Sequence[Any]:
         """Return a seed for each plant: an integer, or None for no new seed.
 
-        `seed` is None, an integer, from which plant i has the seed `seed` + i, or a list with
-        an integer or None for each plant. Any other value raises a ValueError.
+        `seed` is None, an integer, or a list with an integer or None for each plant. From an
+        integer, plant i gets the seed `seed` + i. Any other value of `seed` raises a
+        ValueError.
         """
         n = self.num_envs
         if seed is None:
@@ -314,31 +314,25 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return list(seeds)
 
     def _checked_actions(self, actions: Any) -> Values:
-        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended.
-
-        A ValueError is raised if the actions are not finite numbers of the shape (num_envs, 1).
-        """
+        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended."""
         return many_actions(actions, self.num_envs, self._ended)
 
 
 class _Window:
-    """The observations of all plants, in memory such that a new sample takes little copying.
+    """The latest observations of n plants, stored so that a new sample needs little copying.
 
-    An observation has four blocks: set points, errors, outputs and past actions, each with the
-    newest sample first. The observations of all plants follow each other in one row of memory.
-    At each step, the place in the row at which the first observation begins moves back by one
-    element, which makes room for a new sample at the head of every block without any copying.
+    An observation joins four blocks: set points, errors, outputs and past actions, each block
+    with the newest sample first. `windows` holds the numbers of set points, errors, outputs and
+    past actions in an observation.
 
-    Parameters
-    ----------
-    windows
-        The sizes of the four blocks of an observation, samples.
-    num_envs
-        Number n of plants.
+    One 1-D array holds the observations of all plants, one observation after the other. At each
+    step, the index at which the first observation begins decreases by 1. Without any copying,
+    each old sample then lies one element later in the observation of its plant, and the new
+    sample replaces the first element of each block.
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
-        # For each block, the index of its newest sample in the observations of all plants; None
+        # For each block, the index of the newest sample in the observations of all plants; None
         # for a block of size 0.
         self._newest: list[tuple[slice, int] | None] = []
         size = 0
@@ -349,7 +343,7 @@ class _Window:
         self._shape = num_envs, size
         self._elements = num_envs * size
         self._row = np.zeros(self._elements + STEPS_PER_SHIFT, np.float32)
-        self._place = STEPS_PER_SHIFT  # index in the row at which the first observation begins
+        self._place = STEPS_PER_SHIFT  # index in `_row` at which the first observation begins
 
     def present(self) -> Observations:
         """Return a copy of the present observations, shape (n, size)."""
@@ -360,17 +354,11 @@ class _Window:
         return self._row[self._place : self._place + self._elements].reshape(self._shape)
 
     def reset(self, which: Indices, setpoint: Values, rest_action: Values) -> None:
-        """Set the observations of some plants to those of a plant at rest, at sample k = 0.
+        """Set the observations of the plants `which` at sample k = 0, with the plants at rest.
 
-        Parameters
-        ----------
-        which
-            The indices of these plants.
-        setpoint
-            Set points y_d(0), degC, shape (len(which),).
-        rest_action
-            Actions for a flow of 0 t/h, shape (len(which),), or () for one action for all
-            plants.
+        `setpoint` holds the set points y_d(0) of the plants `which`, degC, shape (len(which),).
+        `rest_action` holds the actions that command 0 t/h, shape (len(which),), or shape () for
+        one action for all plants.
         """
         observations = np.zeros((len(which), self._shape[1]), np.float32)
         observed_action = np.clip(rest_action, -1.0, 1.0)
@@ -387,8 +375,8 @@ class _Window:
     ) -> Observations:
         """Add a sample of all plants, and return a copy of the observations, shape (n, size).
 
-        The sample has set points y_d(k+1), observed errors and outputs, degC, and normalised
-        actions a(k), all of shape (n,).
+        The sample consists of set points y_d(k+1), observed errors and outputs, all in degC,
+        and normalised actions a(k), each of shape (n,).
         """
         if self._place == 0:  # no element of the row is left before the first observation
             self._row[STEPS_PER_SHIFT:] = self._row[:-STEPS_PER_SHIFT]

@@ -1,7 +1,7 @@
 """Check single values of arguments and actions.
 
-A check is a function of an argument's name and value. The check returns the value in Python's
-own types, or raises a ValueError that names the argument.
+A check is a function that takes the name and the value of an argument. A check returns the
+value in Python's own types, or raises a ValueError that names the argument.
 """
 
 import math
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 # Largest magnitude of an argument. Larger numbers would make float32 observations and squared
 # errors meaningless.
 LARGEST_NUMBER: Final[Any] = 10**9
-# The next three limits are far above what any plant needs. Without these limits, a mistyped
-# number could fill the memory.
+# The limits of the delay, of the coefficients and of the number of plants are far above what is
+# ever needed. Without these limits, a mistyped number could fill the memory.
 LONGEST_DELAY_OR_WINDOW: Final = 10_000  # samples
 MOST_COEFFICIENTS: Final = 1_000  # of one polynomial of the plant
 MOST_PLANTS: Final = 10_000_000  # in one environment, or in one evaluation
@@ -39,9 +39,9 @@ def reject(name: str, value: object, allowed: str) -> NoReturn:
 
 
 def shorten(value: object) -> str:
-    """Return the repr of a value, for a message, cut to its first 80 characters.
+    """Return the repr of a value for an error message, cut to the first 80 characters.
 
-    If the repr is cut, the length of a list or the shape of an array follows.
+    If the repr is cut, the result ends with the length of a list or the shape of an array.
     """
     text = repr(value)
     length = ""
@@ -56,12 +56,12 @@ def shorten(value: object) -> str:
 
 
 def one_action(action: Any) -> float:
-    """Return the action of one plant as a float.
+    """Return the checked action of one plant as a float.
 
     Parameters
     ----------
     action
-        A number, or an array or a tensor with one element.
+        Normalised action: a number, or an array or a tensor with one element.
 
     Raises
     ------
@@ -81,22 +81,22 @@ def one_action(action: Any) -> float:
 def many_actions(
     actions: Any, num_envs: int, ignored: NDArray[np.bool_] | None
 ) -> NDArray[np.float64]:
-    """Return the actions of many plants in a new array, shape (num_envs,).
+    """Return the checked actions of many plants in a new array, shape (num_envs,).
 
     Parameters
     ----------
     actions
-        One number for each plant, shape (num_envs, 1), in an array, a list or a tensor.
+        Normalised actions of the plants, shape (num_envs, 1), in an array, a list or a tensor.
     num_envs
         Number of plants.
     ignored
-        True for each plant whose action is ignored, shape (num_envs,): an ignored action may be
-        infinite or NaN, and becomes 0. None if no action is ignored.
+        Mask of the plants whose actions are ignored and become 0, shape (num_envs,), or None
+        for no plant. An ignored action may be infinite or NaN.
 
     Raises
     ------
     ValueError
-        If `actions` has another shape, or if an action is not a finite number.
+        If the shape of `actions` is not (num_envs, 1), or if an action is not a finite number.
     """
     array = _as_float64(actions)
     if array is None or array.shape != (num_envs, 1):
@@ -111,7 +111,7 @@ def many_actions(
 
 
 def _as_float64(values: Any) -> NDArray[np.float64] | None:
-    """Return an array, list or tensor as a new float64 array; None if not all are numbers."""
+    """Return `values` as a new float64 array, or None if an element is not a number."""
     try:
         array = np.asarray(values)
         if array.dtype.hasobject:
@@ -122,9 +122,9 @@ def _as_float64(values: Any) -> NDArray[np.float64] | None:
 
 
 def to_python(value: Any) -> Any:
-    """Return a value, or a list or tuple of values, without the types of NumPy.
+    """Return `value` with NumPy arrays and numbers converted to lists and Python numbers.
 
-    An array becomes a list, and a NumPy number becomes a Python number.
+    The conversion includes NumPy values inside a list or tuple.
     """
     if isinstance(value, list | tuple):
         return type(value)(map(to_python, value))
@@ -146,7 +146,7 @@ def is_count(value: Any, minimum: int = 0) -> bool:
 
 
 def number(name: str, value: Any, low: float = -LARGEST_NUMBER) -> float:
-    """Return the value of an argument as a float; ValueError unless it is from `low` to 1e9."""
+    """Return an argument's value as a float; ValueError unless a number from `low` to 1e9."""
     if not is_number(value) or value < low:
         reject(name, value, f"a number from {low:g} to {LARGEST_NUMBER:g}")
     return float(value) + 0.0  # which turns -0.0 into 0.0
@@ -158,9 +158,10 @@ at_least_1 = partial(number, low=1.0)
 
 
 def count(name: str, value: Any, minimum: int, maximum: int) -> int:
-    """Return the value of an argument as an int; ValueError unless `value` is an integer.
+    """Return the value of an argument as an int.
 
-    The integer must lie between `minimum` and `maximum`, both included.
+    A ValueError is raised unless `value` is an integer from `minimum` to `maximum`, both
+    included.
     """
     if not is_count(value, minimum) or value > maximum:
         reject(name, value, f"an integer from {minimum} to {maximum:,}")
@@ -176,8 +177,8 @@ def numbers(
 ) -> tuple[float, ...]:
     """Return an argument's value, a list or tuple of 1 to `most` numbers, as a tuple of floats.
 
-    A ValueError that says what is `allowed` is raised for any other value, and if a number is
-    not within +-1e9.
+    A ValueError with the text `allowed` is raised unless `value` is a list or tuple of 1 to
+    `most` numbers within +-1e9.
     """
     if not isinstance(value, list | tuple) or not 0 < len(value) <= most:
         reject(name, value, allowed)
@@ -191,7 +192,7 @@ def numbers(
 
 
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
-    """Return the coefficients of a polynomial as floats; ValueError unless the first is 1."""
+    """Return a polynomial's coefficients as floats; ValueError unless the first one is 1."""
     allowed = f"{_COEFFICIENTS}, the first of them 1"
     coefficients = numbers(name, value, allowed)
     if coefficients[0] != 1.0:
@@ -212,8 +213,8 @@ reward = partial(one_of, choices=REWARDS)
 def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     """Return the argument `setpoint`: one of `SETPOINTS`, a float, or a tuple of floats.
 
-    A float is a constant set point, degC, and a tuple holds a set point for each sample, degC.
-    A ValueError is raised for any other value.
+    A float is a constant set point, in degC. A tuple holds a set point for each sample, in
+    degC. A ValueError is raised if `value` is not a valid set point.
     """
     allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
     if isinstance(value, list | tuple):
@@ -228,8 +229,9 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
 def number_or_range(check: Callable[[str, Any], float], name: str, value: Any) -> Number:
     """Return the value of an argument: one number, or a range (low, high) of two numbers.
 
-    `check` checks a single number. A ValueError is raised if a number does not pass `check`, or
-    if `value` is a list or tuple that is not a range.
+    `check` is a function that checks an argument that is one number. A ValueError is raised if
+    `value` is neither a number that passes `check`, nor a list or tuple of two such numbers,
+    the lower number first.
     """
     if not isinstance(value, list | tuple):
         return check(name, value)

@@ -1,15 +1,17 @@
-"""Step the plant and its actuator, without set point, reward and Gymnasium.
+"""Simulate the plant and the actuator, without set point, reward and Gymnasium.
 
-There are two implementations: `Plant` in Python floats, which is fastest for one plant, and
-`PlantBatch` in NumPy arrays for many plants. Both classes do the same operations in the same
-order, so the results of both classes are equal bit for bit.
+`Plant` simulates one plant in Python floats, which is the fastest way for one plant.
+`PlantBatch` simulates many plants in NumPy arrays. `Plant` and `PlantBatch` do the same
+operations in the same order, so that the results are equal bit for bit.
 
-Equations (28) and (29) of the paper (see `MiddlePointEnv`) are the plant and the actuator::
+The paper that the docstring of `MiddlePointEnv` cites describes the plant by equation (28) and
+the actuator by equation (29)::
 
     (28)  A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k)
     (29)  u_a = 0 where |u| < dead_zone, otherwise u limited to [u_min, u_max]
 
-with temperature y, commanded flow u, applied flow u_a, delay d in samples and white noise xi.
+In equations (28) and (29), y is the temperature, u the commanded flow, u_a the applied flow, d
+the delay in samples and xi white noise.
 """
 
 from collections import deque
@@ -25,16 +27,18 @@ Values = NDArray[np.float64]  # one element per plant, shape (n,)
 # In NumPy arithmetic, an array of one element is faster than a Python number.
 _ZERO = np.array(0.0)
 _ONE = np.array(1.0)
-# Samples between two changes of drifting dynamics: drifts are slow, and a change takes time.
+# Number of samples between two changes of a drifting gain or time constant: drifts are slow,
+# and computing a change takes time.
 DRIFT_INTERVAL: Final = 10
 FACTORS: Final = "gain_factor", "time_constant_factor"  # keys of the drift factors in infos
 
 
 def action_from_command(command: Any, u_min: Any, u_max: Any) -> Any:
-    """Return the normalised action, -1 at `u_min` and 1 at `u_max`, for a flow command in t/h.
+    """Return the normalised action for a flow command: -1 for `u_min`, and 1 for `u_max`.
 
-    The arguments and the result are floats, or arrays or tensors that broadcast. A command
-    beyond the limits gives an action beyond -1 or 1.
+    Flow command and limits are in t/h, as floats, arrays or tensors that can be broadcast. A
+    command below `u_min` gives an action below -1, and a command above `u_max` an action above
+    1.
     """
     return 2.0 * (command - u_min) / (u_max - u_min) - 1.0
 
@@ -42,10 +46,10 @@ def action_from_command(command: Any, u_min: Any, u_max: Any) -> Any:
 def least_effective_command(
     dead_zone: Any, u_min: Any, u_max: Any, rounding: float = 2.0**-50
 ) -> Any:
-    """Return the smallest magnitude of a flow command that passes the dead zone, in t/h.
+    """Return the smallest magnitude of a flow command, t/h, that the dead zone lets pass.
 
     The result is a few rounding errors smaller than `dead_zone`, so that a command on the edge
-    of the dead zone still has an effect after it was scaled to an action and back.
+    of the dead zone still has an effect after scaling to an action and back.
 
     Parameters
     ----------
@@ -54,18 +58,20 @@ def least_effective_command(
     u_min, u_max
         Limits of the actuator, t/h.
     rounding
-        Bound of the accumulated rounding error, as a share of the sum of range and limits. The
-        default, 2^-50, covers 8 roundings of 2^-53 in float64.
+        Upper bound of the accumulated rounding error, divided by u_max - u_min + |u_max| +
+        |u_min|. The default, 2^-50, is enough for 8 float64 operations with a relative rounding
+        error of 2^-53 each.
     """
     return dead_zone - rounding * (u_max - u_min + abs(u_max) + abs(u_min))
 
 
 def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
-    """Return the float32 actions that make the environment apply flow commands in t/h.
+    """Return the float32 actions with which the environment commands given flows in t/h.
 
     Rounding to float32 can move a command from the edge of the dead zone into the dead zone:
-    float32(0.7) stands for 6.99999988 t/h. An action that has lost its effect by rounding is
-    moved away from the dead zone, by the spacing of float32 numbers near 1.
+    with the default limits, the action float32(0.7) commands 6.99999988 t/h, which is inside a
+    dead zone of 7 t/h. If rounding moves a command into the dead zone, the action is moved out
+    of the dead zone by the spacing of float32 numbers near 1.
 
     Parameters
     ----------
@@ -94,28 +100,32 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 
 
 class Dynamics:
-    """The coefficients of the plant as functions of steady-state gain and time constant.
+    """The coefficients of the plant for a given steady-state gain and time constant.
 
     The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k),
-    with temperature y, applied flow u_a, delay d and white noise xi. The polynomial A is (1 - p
-    z^-1) Q, where p is the slowest pole. Two factors, g and t, change the plant: the
-    steady-state gain is g B(1) / A(1), and the time constant is t / (1 - p) samples. The time
-    constant is the area above the step response of 1 / (1 - p z^-1), scaled to end at 1. To
-    multiply the time constant by t, the slowest pole p moves so that 1 - p is divided by t; the
-    polynomial Q, which holds the other poles, stays. As A(1) = (1 - p) Q(1) is then divided by
-    t, the polynomial B is multiplied by g / t.
+    with temperature y, applied flow u_a, delay d and white noise xi. The polynomial A is
+    (1 - p z^-1) Q(z^-1), where p is the slowest pole and Q holds the other poles.
+
+    A gain factor g makes the steady-state gain g B(1) / A(1). A time constant factor t makes
+    the dominant time constant t / (1 - p) samples. The time constant 1 / (1 - p) is the area
+    above the step response of the filter (1 - p) z^-1 / (1 - p z^-1), which rises from 0 to 1.
+
+    The time constant factor t divides 1 - p, and leaves the polynomial Q unchanged. Dividing
+    1 - p by t also divides A(1) = (1 - p) Q(1) by t. To give the steady-state gain
+    g B(1) / A(1), the polynomial B is therefore multiplied by g / t.
 
     Parameters
     ----------
     parameters
-        The arguments of the environment.
+        Arguments of the environment.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._drift_samples = parameters.drift_samples
         self._negated_a = [-coefficient for coefficient in parameters.a[1:]]
         self._sum_of_a = sum(parameters.a)  # A(1)
-        # The coefficients of Q from z^0 on, and a 0; empty if the time constant never changes.
+        # The coefficients of Q from z^0 on, followed by 0. The list is empty if the time
+        # constant never changes.
         self._quotient: list[float] = []
         if parameters.changes_time_constant:
             pole = slowest_pole(parameters.a).real  # a real one, as Parameters has checked
@@ -124,11 +134,11 @@ class Dynamics:
             self._quotient = [*quotient.tolist(), 0.0]
 
     def drift_share(self, age: Any) -> Any:
-        """Return which share of the drifts of gain and time constant is complete at k = `age`.
+        """Return the share of the drift of gain and time constant that is complete.
 
-        The share of a drift that is complete grows linearly from 0 at sample k = 0 to 1 at
-        sample k = `drift_samples`, and then stays 1. `age` and the result are numbers, or
-        arrays or tensors with an element for each plant.
+        The complete share of a drift grows linearly from 0 at sample k = 0 to 1 at sample k =
+        `drift_samples`, and is 1 afterwards. `age` is the present sample k: a number, or an
+        array or tensor with one element per plant. The returned share has the shape of `age`.
         """
         share = age / self._drift_samples
         return share * (share < 1.0) + (share >= 1.0)  # at most 1, for arrays of any library
@@ -136,15 +146,17 @@ class Dynamics:
     def factors(self, numbers: PlantNumbers[Any], age: Any) -> tuple[Any, Any]:
         """Return the gain factor g and the time constant factor t at sample k = `age`.
 
-        g and t are multiples of the gain and of the time constant that the arguments `a` and
-        `b` give: two floats, or two arrays or tensors of shape (n,) for n plants.
+        g is the steady-state gain divided by the gain of the arguments `a` and `b`, and t is
+        the time constant divided by the time constant of the argument `a`. g and t are floats,
+        or arrays or tensors of shape (n,) for n plants.
 
         Parameters
         ----------
         numbers
-            The plant numbers, which hold the factors at k = 0 and the drifts.
+            Parameter values of the plants, such as `gain_factor` and `gain_drift`.
         age
-            Samples since the start of the episode: a number, or one element for each plant.
+            Number of samples since the start of the episode: a number, or an array or tensor
+            with one element per plant.
         """
         share = self.drift_share(age)
         gain = numbers.gain_factor
@@ -155,24 +167,25 @@ class Dynamics:
         )
 
     def coefficients(self, gain: Any, time_constant: Any) -> tuple[list[Any], Any, Any]:
-        """Return the coefficients of the plant, equation (28) of the paper, for given factors.
+        """Return the plant's coefficients for a given gain factor g and time constant factor t.
 
         Parameters
         ----------
         gain, time_constant
-            g and t, as multiples of the gain and of the time constant of the polynomials A and
-            B: floats, or arrays or tensors of shape (n,) for n plants.
+            Gain factor g and time constant factor t: multiples of the steady-state gain and of
+            the time constant of the polynomials A and B, as floats, or as arrays or tensors of
+            shape (n,) for n plants.
 
         Returns
         -------
         alpha : list
-            Factors of the outputs y(k-1), y(k-2), ...: the coefficients of A from z^-1 on,
-            negated.
+            Factors of the temperatures y(k-1), y(k-2), ... in equation (28): the negated
+            coefficients of the polynomial A from z^-1 on.
         scale : float or array
-            Factor g / t of the polynomial B.
+            Factor g / t, by which the polynomial B is multiplied.
         load_gain : float or array
-            A(1) after the change of the time constant: the factor of the load w(k), with which
-            a constant load w adds w to the steady-state temperature.
+            Factor of the load disturbance w(k) in equation (28): A(1) for the given time
+            constant, so that a constant load w adds w to the steady-state temperature.
         """
         alpha: list[Any] = self._negated_a
         if self._quotient:
@@ -187,23 +200,24 @@ class Dynamics:
 class Plant:
     """One plant with its actuator, initially at rest: equations (28) and (29) of the paper.
 
-    As printed in the paper, equation (29) compares the magnitude of the command u with U_min in
-    one of its cases. The intended meaning is: a command inside the dead zone has no effect, and
-    a command on the edge of the dead zone or outside is limited to [U_min, U_max].
+    One case of equation (29), as printed in the paper, compares the magnitude of the command u
+    with the lower limit U_min. `Plant` implements the intended meaning of equation (29): a
+    command inside the dead zone has no effect, and a command on the edge of the dead zone or
+    outside the dead zone is limited to [U_min, U_max].
 
     Parameters
     ----------
     parameters
-        The arguments of the environment.
+        Arguments of the environment.
     numbers
-        The plant numbers of the episode, in place of the ranges in `parameters`.
+        Parameter values of the plant in this episode, in place of the ranges in `parameters`.
 
     Attributes
     ----------
     factors : dict of float
-        If gain and time constant drift, the present factors "gain_factor" and
-        "time_constant_factor", as multiples of the gain and of the time constant of the
-        polynomials A and B. Empty if neither drifts.
+        Values of "gain_factor" and "time_constant_factor" at the present sample, as multiples
+        of the gain and of the time constant of the polynomials A and B. `factors` is empty if
+        neither gain nor time constant drifts.
     """
 
     def __init__(self, parameters: Parameters, numbers: PlantNumbers[float]) -> None:
@@ -222,7 +236,7 @@ class Plant:
         past_flows = delay + len(parameters.b)
         self._outputs = deque([0.0] * len(self._alpha), maxlen=len(self._alpha))
         self._flows = deque([0.0] * past_flows, maxlen=past_flows)
-        # Each coefficient of B with the index of its flow in `_flows`.
+        # Pairs of the index of a past flow in `_flows` and the coefficient of B for this flow.
         self._beta = tuple(enumerate(parameters.b, start=delay))
 
     def step(self, action: float, noise: float, load: float) -> tuple[float, float, float]:
@@ -231,7 +245,8 @@ class Plant:
         Parameters
         ----------
         action
-            Normalised action a(k): -1 commands `u_min`, and 1 commands `u_max`.
+            Normalised action a(k): -1 commands the flow `u_min`, and 1 commands the flow
+            `u_max`.
         noise
             Coloured noise n(k+1) of equation (28) of the paper, degC.
         load
@@ -246,8 +261,8 @@ class Plant:
             self._age += 1
             if self._age % DRIFT_INTERVAL == 0:
                 self._update_dynamics()
-        # Last formula of the paper's Section 4, which scales network outputs from 0 to 1, for
-        # actions from -1 to 1.
+        # The last formula of the paper's Section 4 scales the outputs of a neural network, from
+        # 0 to 1, to flows. Here, the formula is rewritten for actions from -1 to 1.
         u_min = self._u_min
         command = u_min + (action + 1.0) * self._half_range
         # Equation (29): dead zone and limits.
@@ -274,34 +289,35 @@ class Plant:
         return command, applied, output
 
     def _update_dynamics(self) -> None:
-        """Compute coefficients and drift factors for the present sample k of the episode."""
+        """Update the plant's coefficients and drift factors to the present sample."""
         factors = self._dynamics.factors(self._numbers, self._age)
         if self._drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
-        # Each factor of a past temperature, with the index of the temperature in `_outputs`.
+        # Pairs of the index of a past temperature in `_outputs` and the factor of this
+        # temperature.
         self._alpha = tuple(enumerate(alpha))
 
 
 class PlantBatch:
-    """Many plants with their actuators, in NumPy arrays; the results equal those of `Plant`.
+    """n plants with actuators in NumPy arrays, with the same results as n objects `Plant`.
 
     Parameters
     ----------
     parameters
-        The arguments of the environment.
+        Arguments of the environment.
     num_envs
         Number n of plants.
 
     Attributes
     ----------
     numbers : PlantNumbers
-        The plant numbers of the present episodes, in arrays of float64: of shape (n,) for the
-        arguments that are ranges, and of shape () for the other arguments.
+        Parameter values of the plants in the present episodes: float64 arrays, of shape (n,)
+        for the arguments that are ranges, and of shape () for all other arguments.
     factors : dict of ndarray of float64
-        If gain and time constant drift, the present factors "gain_factor" and
-        "time_constant_factor", shape (n,), as multiples of the gain and of the time constant of
-        the polynomials A and B of equation (28) of the paper. Empty if neither drifts.
+        Values of "gain_factor" and "time_constant_factor" at the present sample, shape (n,), as
+        multiples of the gain and of the time constant of the polynomials A and B. `factors` is
+        empty if neither gain nor time constant drifts.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
@@ -315,8 +331,9 @@ class PlantBatch:
         self._update_actuator()
 
         self._dynamics = Dynamics(parameters)
-        # Times of the drifts, in samples since the plants were created: the present time, the
-        # start of each plant's episode, and when the dynamics of some plant change next.
+        # Times in samples since the plants were created: the present time, the start of each
+        # plant's episode, and the time at which the next drifting gain or time constant
+        # changes.
         self._clock = 0
         self._starts: NDArray[np.int64] = np.zeros((), np.int64)
         if parameters.drifts:
@@ -329,10 +346,11 @@ class PlantBatch:
         self._input_response = _InputResponse(parameters, num_envs)
 
     def reset(self, plants: NDArray[np.intp], numbers: PlantNumbers[Values]) -> None:
-        """Bring the plants with the indices `plants` to rest, and set their plant numbers.
+        """Bring the plants with the indices `plants` to rest, and set the parameter values.
 
-        `numbers` holds arrays of shape (len(plants),) for the arguments that are ranges, and of
-        shape () for the other arguments.
+        `numbers` holds the parameter values of the plants `plants`: arrays of shape
+        (len(plants),) for the arguments that are ranges, and of shape () for all other
+        arguments.
         """
         for outputs in self._outputs:
             outputs[plants] = 0.0
@@ -394,7 +412,7 @@ class PlantBatch:
         return command, applied, output
 
     def _update_actuator(self) -> None:
-        """Compute what `step` needs from limits and dead zones, after these change."""
+        """Update the limits and dead zones of `step` after the parameter values change."""
         u_min = self.numbers.u_min
         u_max = self.numbers.u_max
         self._half_range = np.array((u_max - u_min) / 2.0)
@@ -404,9 +422,9 @@ class PlantBatch:
         self._u_max = np.full(self._num_envs, u_max)
 
     def _update_dynamics(self) -> None:
-        """Compute coefficients and drift factors for the present sample k of each plant.
+        """Update coefficients and drift factors to the present sample of each plant.
 
-        Dynamics that drift change only at samples k that are multiples of `DRIFT_INTERVAL`.
+        A drifting gain or time constant changes every `DRIFT_INTERVAL` samples of an episode.
         """
         ages = self._clock - self._starts  # the present sample k of each plant's episode
         ages_at_change = ages // DRIFT_INTERVAL * DRIFT_INTERVAL  # at the latest change
@@ -420,22 +438,16 @@ class PlantBatch:
 
 
 class _InputResponse:
-    """The part of the temperature that past flows cause, B(z^-1) u_a(k-d), for many plants.
+    """The response of n plants to past flows: the part B(z^-1) u_a(k-d) of the temperature.
 
     B is the polynomial of equation (28) of the paper, u_a the applied flow and d the delay, in
-    samples. A flow affects no temperature of the next d samples, where d is the shortest
-    possible delay. The effect of a block of d + 1 flows is therefore computed at once, when the
-    block is complete, and then read sample by sample.
+    samples. With a shortest possible delay of s samples, a flow cannot affect the temperatures
+    of the next s samples. The responses to a block of s + 1 successive flows are therefore
+    computed at once, after the last flow of the block, and then returned sample by sample.
 
-    The flows lie in rows, one row per sample, the oldest sample first: the older flows that B
-    and longer delays also need, and then the flows of the block.
-
-    Parameters
-    ----------
-    parameters
-        The arguments of the plants.
-    num_envs
-        Number n of plants.
+    The array `_flows` has one row of applied flows per sample, the oldest sample first. The
+    last rows of `_flows` are the block of flows that `add` fills. The first rows of `_flows`
+    hold older flows, which the polynomial B and the longer delays need.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
@@ -443,24 +455,26 @@ class _InputResponse:
         self._beta = tuple(parameters.b)
         shortest, self._longest = map(int, parameters.range_of("delay"))
         self._block_rows = shortest + 1
-        # Rows before the block, with the older flows that B and longer delays need.
+        # Number of rows of `_flows` above the block of flows, with the older flows.
         self._older_rows = len(self._beta) - 1 + self._longest - shortest
         self._flows = np.zeros((self._older_rows + self._block_rows, num_envs))
         self._response = np.zeros((self._block_rows, num_envs))
-        # Index of the next flow in the block. The first flow completes a block, whose other
-        # flows, before k = 0, are 0.
+        # Index of the next flow in the block of flows. The flow at k = 0 is the last flow of
+        # the first block, because all flows before k = 0 are 0.
         self._next_row = self._block_rows - 1
-        # Used only if the delays differ: the flows in `_flows` that act on the block after the
-        # delay of each plant, and the indices of these flows in the flattened `_flows`.
+        # Used only if the delays of the plants differ. `_delayed_indices` selects, in the
+        # flattened `_flows`, the flows to which each plant responds after the plant's own
+        # delay, and `_delayed_flows` holds these flows.
         self._delays_differ = self._longest > shortest
         delayed_rows = len(self._beta) - 1 + self._block_rows
         self._delayed_flows = np.zeros((delayed_rows, num_envs))
         self._delayed_indices = np.zeros((delayed_rows, num_envs), np.intp)
 
     def reset(self, plants: NDArray[np.intp], delays: Values) -> None:
-        """Begin an episode of the plants with the indices `plants`; past flows count as 0.
+        """Begin an episode of the plants with the indices `plants`, with past flows of 0 t/h.
 
-        `delays` holds the delays of these plants, samples, shape (len(plants),) or ().
+        `delays` holds the delays of the plants `plants` in samples, shape (len(plants),), or
+        shape () for one delay of all plants.
         """
         self._flows[:, plants] = 0.0
         self._response[:, plants] = 0.0
@@ -470,10 +484,11 @@ class _InputResponse:
             self._delayed_indices[:, plants] = rows * self._num_envs + plants
 
     def add(self, applied: Values) -> Values:
-        """Add the applied flows of sample k, and return the effect of flows on y(k+1).
+        """Add the applied flows u_a(k), and return the response B(z^-1) u_a(k+1-d), degC.
 
-        `applied` holds the flows u_a(k), t/h, shape (n,). The result is B(z^-1) u_a(k+1-d), a
-        part of y(k+1), degC, shape (n,); the caller must not modify the result.
+        `applied` holds the flows u_a(k) of the plants in t/h, shape (n,). The returned response
+        to the flows is a part of the temperatures y(k+1), shape (n,). The caller must not
+        modify the returned array.
         """
         self._flows[self._older_rows + self._next_row] = applied
         self._next_row += 1
@@ -484,7 +499,7 @@ class _InputResponse:
         return response
 
     def _respond(self) -> None:
-        """Compute the effect of a complete block of flows, and make room for the next block."""
+        """Compute the responses to a complete block of flows, and make room for new flows."""
         flows = self._flows
         if self._delays_differ:
             # "clip" is faster than a check of the indices, which are always valid.

@@ -23,8 +23,8 @@ _LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 def _argument(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
     """Return a dataclass field for one argument of the environment.
 
-    The metadata of the field hold the other three arguments of this function by name. `check`
-    is a function of the argument's name and value.
+    The metadata of the dataclass field hold the arguments `check`, `unit` and `meaning` by
+    name. `check` is a function that takes the name and the value of the argument.
     """
     metadata = {"check": check, "unit": unit, "meaning": meaning}
     return field(default=default, metadata=metadata)
@@ -34,13 +34,14 @@ def _argument(default: Any, check: checks.Check, unit: str, meaning: str) -> Any
 class PlantNumbers(Generic[Value]):
     """The arguments of a plant that can differ from episode to episode, such as the delay.
 
-    As arguments of the environment, the fields are of type `Number`: one number, or a range
+    In the arguments of the environment, each field of `PlantNumbers` is one number, or a range
     [low, high] from which each reset of the environment samples one number. During an episode,
-    the fields are floats for one plant, and arrays or tensors for many plants.
+    each field of `PlantNumbers` is a float for one plant, or an array or tensor for many
+    plants.
 
-    If field i is a range, the number that a reset samples is computed from random number i of
-    the episode. The order of the fields therefore never changes, and a new field comes last:
-    otherwise a seed would stand for another plant.
+    If field i of `PlantNumbers` is a range, a reset computes the value of field i from random
+    number i of the episode. The order of the fields of `PlantNumbers` must therefore never
+    change, and a new field must come last: otherwise the same seed would give another plant.
     """
 
     delay: Value = _argument(
@@ -116,19 +117,20 @@ def slowest_pole(a: Sequence[float]) -> complex:
 class Parameters(PlantNumbers[Number]):
     """The arguments of `MiddlePoint-v0`, checked and converted to Python's own types.
 
-    In the table, (28) is the paper's equation of the plant, and (29) the paper's equation of
-    the actuator; see `MiddlePointEnv` for both equations and for the paper. The defaults are
-    the first case of the paper (Section 5, Fig. 5). All temperatures and flows are deviations
-    from the operating point. An asterisk marks an argument that can be a range [low, high],
-    from which each `reset` samples a number.
+    In the table of arguments, (28) is the paper's equation of the plant, and (29) the paper's
+    equation of the actuator; the docstring of `MiddlePointEnv` states both equations and cites
+    the paper. The default arguments are the first case of the paper (Section 5, Fig. 5). All
+    temperatures and flows are deviations from the boiler's operating point. In the table of
+    arguments, an asterisk marks an argument that can be a range [low, high], from which each
+    `reset` samples a number.
 
     <arguments>
 
     Raises
     ------
     ValueError
-        If an argument is out of range. The message names the argument, the value and what is
-        allowed.
+        If the value of an argument is not allowed. The message of the error names the argument,
+        the value and the allowed values.
     """
 
     # The plant, equation (28) of the paper, with temperature y, applied flow u_a, delay d and
@@ -245,10 +247,10 @@ class Parameters(PlantNumbers[Number]):
         Raises
         ------
         TypeError
-            If the name of an argument is unknown. The message suggests a similar name, if there
-            is one.
+            If the name of an argument is unknown. The message of the error suggests a similar
+            name of an argument, if possible.
         ValueError
-            If an argument is out of range.
+            If the value of an argument is not allowed.
         """
         for name in arguments:
             if name == "render_mode":
@@ -263,28 +265,29 @@ class Parameters(PlantNumbers[Number]):
         return cls(**arguments)
 
     def _check_actuator(self) -> None:
-        """Raise a ValueError if, at some reset, no command could have an effect.
+        """Raise a ValueError if a reset could sample a dead zone that no flow command can pass.
 
-        For all numbers that a reset may sample, `u_min` must be below `u_max`, and the dead
-        zone must not exceed the larger magnitude of the two limits.
+        For all values that a reset may sample from ranges, `u_min` must be below `u_max`, and
+        `dead_zone` must not exceed max(|u_min|, |u_max|).
         """
         lowest_u_min, highest_u_min = self.range_of("u_min")
         lowest_u_max, highest_u_max = self.range_of("u_max")
         if highest_u_min >= lowest_u_max:
             reject("u_min", self.u_min, f"below u_max = {self.u_max}")
-        # The reach is the smallest value of max(|u_min|, |u_max|), the largest magnitude of a
-        # flow. Over a range [low, high], the smallest magnitude is max(low, -high, 0).
-        reach = max(lowest_u_min, -highest_u_min, lowest_u_max, -highest_u_max, 0.0)
+        # The smallest value of max(|u_min|, |u_max|), the largest magnitude of a flow command.
+        # In a range [low, high], the smallest magnitude is max(low, -high, 0).
+        largest_command = max(lowest_u_min, -highest_u_min, lowest_u_max, -highest_u_max, 0.0)
         _, largest_dead_zone = self.range_of("dead_zone")
-        if largest_dead_zone > reach:
+        if largest_dead_zone > largest_command:
             allowed = "small enough for some command to pass, at most max(|u_min|, |u_max|)"
-            reject("dead_zone", self.dead_zone, f"{allowed} = {reach:g}")
+            reject("dead_zone", self.dead_zone, f"{allowed} = {largest_command:g}")
 
     def _check_time_constant(self) -> None:
-        """Raise a ValueError if the time constant of the plant cannot be changed as requested.
+        """Raise a ValueError if a change of the time constant is not possible with this `a`.
 
-        The slowest pole of the polynomial A of equation (28) of the paper must lie between 0
-        and 1, and must not become negative by any factor or drift of the time constant.
+        The slowest pole of 1 / A(z^-1), with the polynomial A of equation (28) of the paper,
+        must lie between 0 and 1, and no factor or drift of the time constant may make this pole
+        negative.
         """
         names = "time_constant_factor", "time_constant_drift"
         pole = slowest_pole(self.a)
@@ -302,7 +305,8 @@ class Parameters(PlantNumbers[Number]):
     def range_of(self, name: str) -> tuple[float, float]:
         """Return the range (low, high) of the field `name` of `PlantNumbers`.
 
-        If the field is one number instead of a range, low and high are equal.
+        If the field `name` is one number instead of a range, low and high both equal the
+        number.
         """
         value = getattr(self, name)
         if isinstance(value, tuple):
@@ -318,7 +322,7 @@ class Parameters(PlantNumbers[Number]):
 
     @cached_property
     def lowest(self) -> PlantNumbers[float]:
-        """All fields of `PlantNumbers`, each range replaced by the range's low end."""
+        """All fields of `PlantNumbers`, each range replaced by the low end of the range."""
         return PlantNumbers(**{name: self.range_of(name)[0] for name in PLANT_NUMBERS})
 
     @cached_property
@@ -327,27 +331,27 @@ class Parameters(PlantNumbers[Number]):
         return self._can_differ(0.0, *_LOAD_ARGUMENTS)
 
     def _can_differ(self, value: float, *names: str) -> bool:
-        """Return whether any of the fields `names` can have another value than `value`."""
+        """Return whether any of the fields `names` can have a value other than `value`."""
         return any(self.range_of(name) != (value, value) for name in names)
 
     @cached_property
     def drifts(self) -> bool:
-        """Whether gain or time constant of the plant change within an episode."""
+        """Whether the gain or the time constant of the plant can change within an episode."""
         return self._can_differ(1.0, "gain_drift", "time_constant_drift")
 
     @cached_property
     def changes_time_constant(self) -> bool:
-        """Whether the time constant can differ from that of `a`, at the start or by drift."""
+        """Whether the plant's time constant can differ from the one that `a` gives."""
         return self._can_differ(1.0, "time_constant_factor", "time_constant_drift")
 
     @cached_property
     def changes_dynamics(self) -> bool:
-        """Whether gain or time constant can differ from those of `a` and `b`, or can drift."""
+        """Whether `gain_factor`, `time_constant_factor` or a drift can change the dynamics."""
         return self.drifts or self._can_differ(1.0, "gain_factor", "time_constant_factor")
 
     @cached_property
     def windows(self) -> tuple[int, int, int, int]:
-        """How many set points, errors, outputs and past actions an observation holds."""
+        """Numbers of set points, errors, outputs and past actions in an observation."""
         return self.setpoint_window, self.error_window, self.output_window, self.action_window
 
 
@@ -355,14 +359,14 @@ ARGUMENTS: Final[dict[str, Any]] = {argument.name: argument for argument in fiel
 """The dataclass field of every argument, by name."""
 
 PLANT_NUMBERS: Final = {number.name: i for i, number in enumerate(fields(PlantNumbers))}
-"""The index of each field of `PlantNumbers`, by name: also the index of its random number."""
+"""Index of each field of `PlantNumbers`, and of the field's random number, by name."""
 
 
 def argument_table() -> str:
     """Return a Markdown table with a row for each argument except `render_mode`.
 
-    The columns are name, default, unit and meaning. An asterisk after the default marks an
-    argument that can be a range.
+    The columns of the table are name, default, unit and meaning. An asterisk after the default
+    marks an argument that can be a range [low, high].
     """
     rows = ["| Argument | Default | Unit | Meaning |", "|---|---|---|---|"]
     for name, argument in ARGUMENTS.items():
@@ -389,8 +393,8 @@ Parameters.__doc__ = insert_table(Parameters.__doc__)
 def full_signature(constructor: Callable[..., Any]) -> inspect.Signature:
     """Return the signature of an environment's `__init__` with all arguments of `Parameters`.
 
-    The signature, for help() and editors, has these arguments in place of `**arguments`, and no
-    `self`.
+    The returned signature, which help() and editors show, lists the arguments of `Parameters`
+    in place of `**arguments`, and leaves out `self`.
     """
     parameters = list(inspect.signature(constructor).parameters.values())
     parameters = parameters[1:-1]  # without `self` and `**arguments`

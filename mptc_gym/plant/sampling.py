@@ -1,6 +1,6 @@
-"""Sample plant numbers, and give every episode of a plant its own random numbers.
+"""Sample the parameter values of plants, with separate random numbers for every episode.
 
-The plant numbers are the fields of `PlantNumbers`, such as delay and dead zone.
+The parameter values of a plant are the fields of `PlantNumbers`, such as the delay.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from mptc_gym.plant.parameters import PLANT_NUMBERS, Parameters, PlantNumbers
 
 Values = NDArray[np.float64]  # one element per plant, shape (n,), or shape () for all plants
 
-# Random numbers that each episode reserves for plant numbers: more than the present 13, so that
-# a new plant number does not change the random numbers that follow.
+# Number of random numbers that each episode reserves for the fields of `PlantNumbers`: more
+# than the present 13 fields, so that a new field does not change the random numbers of the
+# load.
 RESERVED_RANDOM_NUMBERS = 32
-# The seed of generators whose state is replaced at once: a seed that is made anew takes time.
+# Seed of random number generators whose state is replaced immediately: creating a new seed for
+# each generator would take time.
 _ANY_SEED = np.random.SeedSequence(0)
 
 
@@ -28,22 +30,22 @@ class EpisodeStream:
     """A stream of random numbers in which every episode has its own starting point.
 
     Episode j begins j * 2**64 random numbers into the stream, however many random numbers the
-    earlier episodes have used. So the j-th episode after a seed always gets the same random
-    numbers.
+    earlier episodes have used. The j-th episode after a seed therefore always has the same
+    random numbers.
 
-    The generator is created at the first episode, because many plants have streams that are
-    never used.
+    The random number generator is created at the first episode, because many plants have
+    streams that are never used.
 
     Parameters
     ----------
     entropy, spawn_key
-        The arguments of the `numpy.random.SeedSequence` from which the stream starts.
+        Arguments of the `numpy.random.SeedSequence` that seeds the stream.
 
     Attributes
     ----------
     generator : numpy.random.Generator
-        The generator of the present episode. The attribute does not exist before the first
-        episode.
+        Random number generator of the present episode. The attribute `generator` does not exist
+        before the first episode.
     """
 
     # Without a dict per stream, the streams of 100,000 plants take little memory.
@@ -57,7 +59,7 @@ class EpisodeStream:
         self._episode = 0
 
     def __deepcopy__(self, memo: dict[int, Any]) -> EpisodeStream:
-        """Return a copy at the same place in the stream, faster than `copy.deepcopy` alone."""
+        """Return a copy at the same place in the stream, faster than the default deep copy."""
         duplicate = copy(self)
         if hasattr(self, "generator"):
             bits: Any = np.random.PCG64(_ANY_SEED)
@@ -66,7 +68,7 @@ class EpisodeStream:
         return duplicate
 
     def next_episode(self) -> np.random.Generator:
-        """Return the generator, moved to the start of the stream's next episode."""
+        """Return the random number generator, moved to the start of the next episode."""
         if self._episode == 0:
             seeds = np.random.SeedSequence(self._entropy, spawn_key=self._spawn_key)
             self.generator = np.random.Generator(np.random.PCG64(seeds))
@@ -80,68 +82,71 @@ class EpisodeStream:
 
 
 class RandomStreams(NamedTuple):
-    """All random number streams of one plant.
+    """The random number streams of one plant, one stream for each kind of random quantity.
 
-    A further stream must be added at the end, so that the random numbers of the existing
-    streams stay the same.
+    A new stream must be the last field of `RandomStreams`, so that the random numbers of the
+    existing streams do not change.
     """
 
     noise: EpisodeStream
     setpoint: EpisodeStream
-    plant: EpisodeStream  # in each episode, first the plant numbers, then the load disturbance
+    plant: EpisodeStream  # in each episode, first parameter values, then the load disturbance
     measurement_noise: EpisodeStream
 
     @classmethod
     def spawn(cls, seeds: np.random.SeedSequence) -> RandomStreams:
-        """Return streams that start at new children of the seed sequence `seeds`.
+        """Return the streams of one plant, seeded by new children of the seed sequence `seeds`.
 
-        A second call for the same seed sequence returns different streams.
+        A second call of `spawn` for the same seed sequence returns different streams.
         """
         children = seeds.spawn(len(cls._fields))
         return cls(*(EpisodeStream(child.entropy, child.spawn_key) for child in children))
 
     @classmethod
     def of_seed(cls, seed: int) -> RandomStreams:
-        """Return the streams that `spawn` first returns for `SeedSequence(seed)`, faster."""
+        """Return the same streams as `spawn(SeedSequence(seed))`, but faster."""
         return cls(*(EpisodeStream(seed, (child,)) for child in range(len(cls._fields))))
 
 
 class PlantSampler:
-    """Sample the plant numbers that are ranges, uniformly, at the start of each episode.
+    """Sample the parameter values of plants at the start of each episode.
 
-    Floats are sampled from [low, high), and integers from low to high, both included. Every
-    plant number has its own random number, whether the plant number is a range or not. So a
-    further range does not change the numbers that a seed samples for the other ranges.
+    From a range of floats, values are sampled uniformly from [low, high), and from a range of
+    integers, uniformly from low to high, both included. Every field of `PlantNumbers` has its
+    own random number, whether the field is a range or not. If another field becomes a range, a
+    seed therefore still gives the same values for the fields that were already ranges.
 
     Parameters
     ----------
     parameters
-        The arguments of the environment, of which the plant numbers may be ranges.
+        Arguments of the environment, some of which may be ranges.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._ranges = parameters.ranges
-        # The load disturbance takes random numbers from the stream `RandomStreams.plant`, too,
-        # after the random numbers that are reserved for the plant numbers.
+        # The load disturbance uses the stream `RandomStreams.plant` as well, after the random
+        # numbers that are reserved for parameter values.
         self._uses_stream = bool(self._ranges) or parameters.is_disturbed
         lowest = {name: np.array(number) for name, number in vars(parameters.lowest).items()}
-        # All plant numbers, in arrays of shape (), each range replaced by its low end.
+        # The value of each field of `PlantNumbers`, or the low end of a field that is a range,
+        # in arrays of shape ().
         self._lowest: PlantNumbers[Values] = PlantNumbers(**lowest)
 
     def sample(self, streams: Sequence[RandomStreams]) -> PlantNumbers[Values]:
-        """Begin the next episode of n plants, and return the plant numbers of this episode.
+        """Begin the next episode of n plants, and return the parameter values of these plants.
 
         Parameters
         ----------
         streams
-            The random number streams of each of these plants. The stream `plant` moves to its
-            next episode if a plant number or the load is random.
+            Random number streams of the n plants, one element per plant. If a parameter value
+            or the load is random, `sample` moves the stream `plant` of each plant to the next
+            episode.
 
         Returns
         -------
         PlantNumbers
-            Plant numbers that are ranges, sampled, in arrays of shape (n,), and the other plant
-            numbers in arrays of shape ().
+            Parameter values of the n plants: arrays of shape (n,) for values that were sampled
+            from ranges, and arrays of shape () for all other values.
         """
         if not self._uses_stream:
             return self._lowest
@@ -150,7 +155,7 @@ class PlantSampler:
             streams_of_plant.plant.next_episode().random(out=uniform_of_plant)
         numbers: dict[str, NDArray[Any]] = {}
         for name, (low, high) in self._ranges.items():
-            share = uniform[:, PLANT_NUMBERS[name]]  # of the range, from 0 to 1, 1 excluded
+            share = uniform[:, PLANT_NUMBERS[name]]  # of the range, uniform in [0, 1)
             if isinstance(low, int):
                 numbers[name] = low + np.floor(share * (high + 1 - low)).astype(int)
             else:
@@ -159,10 +164,10 @@ class PlantSampler:
 
 
 def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
-    """Return the plant numbers of the plant with index `i`, as Python numbers.
+    """Return the parameter values of the plant with index `i`, as Python numbers.
 
-    `numbers` holds the plant numbers of n plants: arrays of shape (n,), or of shape () for a
-    number that all plants share.
+    `numbers` holds the parameter values of n plants: arrays of shape (n,), or of shape () for a
+    value that all plants share.
     """
     numbers_of_plant: dict[str, float] = {}
     for name, values in vars(numbers).items():

@@ -1,14 +1,15 @@
 """Generate the external signals of an episode: set point, noise and load disturbance.
 
-Every signal class has three methods. `reset` begins an episode of some plants at sample k = 0.
-`next` returns the next sample of all plants. Where there is one plant only, `ahead` returns the
-next `SAMPLES_AT_A_TIME` samples, which is faster.
+Every signal class has the methods `reset`, `next` and `ahead`. `reset` begins an episode of
+some plants at sample k = 0. `next` returns the values of a signal at the next sample, one value
+per plant. In an environment with one plant, `ahead` returns the values of a signal at the next
+`SAMPLES_AT_A_TIME` samples, which is faster than calls of `next`.
 
-Random numbers are drawn many at a time: one call is much faster than many calls, and returns
-the same random numbers.
+Signals draw many random numbers at a time, because one call of a random number generator is
+much faster than many calls and returns the same random numbers.
 
-The names in formulas are those of the paper: set point y_d(k), temperature y(k), coloured noise
-n(k) = C(z^-1) xi(k) with white noise xi, and, not in the paper, load disturbance w(k).
+Formulas use the symbols of the paper: set point y_d(k), temperature y(k), and coloured noise
+n(k) = C(z^-1) xi(k) with white noise xi. The load disturbance w(k) is not in the paper.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ from numpy.typing import NDArray
 from mptc_gym.plant.parameters import Parameters, PlantNumbers
 from mptc_gym.plant.sampling import EpisodeStream, RandomStreams
 
-# One element per plant, shape (n,); a plant number that all plants share has the shape ().
+# One element per plant, shape (n,); a value that all plants share has the shape ().
 Values = NDArray[np.float64]
 Indices = NDArray[np.intp]  # the indices of some plants, in ascending order
 StreamsOfPlants = Mapping[int, RandomStreams] | Sequence[RandomStreams]  # by index of the plant
 
 SAMPLES_AT_A_TIME = 600  # samples of a signal that are generated together
-PLANTS_AT_A_TIME = 32  # so few that their random numbers stay in the processor's cache
+PLANTS_AT_A_TIME = 32  # so few that the random numbers stay in the cache of the CPU
 LOAD_INTERVAL = 10  # samples between two changes of the load disturbance, which is slow
-LOADS_AT_A_TIME = SAMPLES_AT_A_TIME // LOAD_INTERVAL  # values of the load generated together
-# Samples that no episode reaches; the number is small enough to be added to another int64.
+LOADS_AT_A_TIME = SAMPLES_AT_A_TIME // LOAD_INTERVAL  # load values generated together
+# Number of samples that no episode reaches, small enough to be added to another int64.
 UNLIMITED = 1 << 62
 ONLY_PLANT = np.zeros(1, np.intp)  # indices of the plants of an environment with one plant
 
@@ -41,9 +42,10 @@ ONLY_PLANT = np.zeros(1, np.intp)  # indices of the plants of an environment wit
 def noise_polynomials(parameters: Parameters) -> dict[str, Sequence[float]]:
     """Return the coefficients of the polynomial that colours each noise, by the noise's name.
 
-    A noise whose variance is always 0 is left out.
-    "noise" has the coefficients of the polynomial C of equation (28) of the paper, from z^0 on.
-    "measurement_noise", the noise of the transmitter, is white: its only coefficient is 1.
+    The entry "noise" holds the coefficients of the polynomial C of equation (28) of the paper,
+    from z^0 on. The entry "measurement_noise" holds one coefficient, 1, because the noise of
+    the transmitter is white. The returned dict has no entry for a noise whose variance is
+    always 0.
     """
     polynomials: dict[str, Sequence[float]] = {}
     if parameters.range_of("noise_variance")[1] > 0.0:
@@ -54,19 +56,20 @@ def noise_polynomials(parameters: Parameters) -> dict[str, Sequence[float]]:
 
 
 class Noise:
-    """The plant's noise or the transmitter's noise, degC, for many plants; 0 at k = 0.
+    """The noise of n plants or of their transmitters, degC, which is 0 at sample k = 0.
 
     Parameters
     ----------
     name
-        "noise" for the coloured noise n(k) = C(z^-1) xi(k) of equation (28) of the paper, with
-        white noise xi; or "measurement_noise" for the noise of the transmitter.
+        Name of the noise: "noise" for the coloured noise n(k) = C(z^-1) xi(k) of equation (28)
+        of the paper, with white noise xi; or "measurement_noise" for the noise of the
+        transmitter.
     c
-        The coefficients of C, from z^0 on.
+        Coefficients of the polynomial that colours the white noise xi, from z^0 on.
     num_envs
         Number n of plants.
     block
-        How many samples are generated at a time.
+        Number of samples of noise that are generated at a time.
     """
 
     def __init__(self, name: str, c: Sequence[float], num_envs: int, block: int) -> None:
@@ -75,22 +78,18 @@ class Noise:
         # Coefficients of C times the standard deviation of the white noise xi, degC, shape
         # (number of coefficients, num_envs, 1).
         self._scaled_c = np.zeros((len(c), num_envs, 1))
-        # The latest white noise of each plant, the oldest first, as multiples of the standard
-        # deviation.
+        # The latest values of the white noise xi of each plant, the oldest first, divided by
+        # the standard deviation of xi.
         self._past_xi = np.zeros((num_envs, len(c) - 1))
-        # The noise of a block, degC: one row per sample, so that the values that all plants
-        # need at once are contiguous.
+        # A block of successive samples of noise, degC: one row per sample, so that the values
+        # for one sample of all plants are contiguous in memory.
         self._block = np.zeros((block, num_envs))
         self._next_row = 0
 
     def reset(
         self, plants: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
     ) -> None:
-        """Begin an episode of the plants with the indices `plants`.
-
-        `streams` holds the random number streams of all plants, and `numbers` the variances of
-        the noise, degC^2, of the plants that begin an episode.
-        """
+        """Begin an episode of the plants with the indices `plants`."""
         deviations = np.sqrt(getattr(numbers, f"{self._name}_variance"))
         self._scaled_c[:, plants] = deviations[..., np.newaxis] * self._c
         self._past_xi[plants] = 0.0
@@ -105,7 +104,7 @@ class Noise:
     def next(self) -> Values:
         """Return the noise of all plants at the next sample, degC, shape (num_envs,).
 
-        The caller must not modify the result.
+        The caller must not modify the returned array.
         """
         if self._next_row == len(self._block):
             self._fill(np.arange(len(self._past_xi)), 0)
@@ -115,16 +114,13 @@ class Noise:
         return noise
 
     def ahead(self) -> list[float]:
-        """Return the noise at the samples of the next block, degC, for the only plant."""
+        """Return the noise of a single plant at the next `len(self._block)` samples, degC."""
         self._fill(ONLY_PLANT, 0)
         noise: list[float] = self._block[:, 0].tolist()
         return noise
 
     def _fill(self, plants: Indices, first_row: int) -> None:
-        """Generate the noise of some plants, from row `first_row` to the end of the block.
-
-        `plants` holds the indices of these plants.
-        """
+        """Fill `_block` with new noise from row `first_row` on, for the plants `plants`."""
         order = len(self._c) - 1
         samples = len(self._block) - first_row
         for start in range(0, len(plants), PLANTS_AT_A_TIME):
@@ -145,7 +141,7 @@ class Noise:
 
 
 class SetPointLevels:
-    """The levels of the set point, degC, and for how many samples each level is held.
+    """The levels of the set point, degC, and the durations of these levels in samples.
 
     Parameters
     ----------
@@ -155,14 +151,15 @@ class SetPointLevels:
     Attributes
     ----------
     random : bool
-        Whether levels and their durations are random.
+        Whether the levels of the set point and their durations are random.
     amplitude : float
-        Largest magnitude of a random level, degC.
+        Largest magnitude of a random level of the set point, degC.
     shortest, longest : int
-        The range of the duration of a random level, samples, both ends included.
+        Shortest and longest duration of a random level of the set point, samples.
     values, lengths : list
-        The levels, degC, and their durations, samples. After the last level, the first level
-        follows again. Both lists are empty if levels are random.
+        Levels of the set point, degC, and durations of these levels, samples. After the last
+        level of the set point, the first level follows again. `values` and `lengths` are empty
+        if the levels are random.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -188,27 +185,22 @@ class SetPointLevels:
             self.lengths = [1] * (len(self.values) - 1) + [UNLIMITED]
 
     def sample(self, stream: EpisodeStream) -> tuple[float, int]:
-        """Return a random level, degC, and its random duration, samples, from `stream`."""
+        """Return a random level, degC, and a random duration of this level, samples."""
         level = stream.generator.uniform(-self.amplitude, self.amplitude)
         length = stream.generator.integers(self.shortest, self.longest, endpoint=True)
         return level, int(length)
 
 
 class _HeldSignal(ABC):
-    """A signal of many plants whose value is held until the time of the next change.
+    """A signal of n plants whose values are constant between the times of changes.
 
-    Times are counted in samples since the plants were created.
-
-    Parameters
-    ----------
-    num_envs
-        Number n of plants.
+    Times of changes are counted in samples since the plants were created.
 
     Attributes
     ----------
     present : ndarray of float64
-        The present value of each plant, degC, shape (num_envs,). Other objects must not modify
-        the array.
+        Value of the signal of each plant at the present sample, degC, shape (num_envs,). Other
+        objects must not modify the array `present`.
     """
 
     def __init__(self, num_envs: int) -> None:
@@ -218,9 +210,9 @@ class _HeldSignal(ABC):
         self._earliest_due = 0
 
     def next(self) -> Values:
-        """Return the values of all plants at the next sample, degC, shape (num_envs,).
+        """Return the signal of all plants at the next sample, degC, shape (num_envs,).
 
-        The caller must not modify the result.
+        The caller must not modify the returned array.
         """
         self._clock += 1
         if self._clock >= self._earliest_due:
@@ -228,16 +220,13 @@ class _HeldSignal(ABC):
         return self.present
 
     def _make_due_changes(self) -> None:
-        """Change the value of each plant whose next change is due at the present time."""
+        """Change the signal of each plant whose next change is due at the present time."""
         self._change(np.flatnonzero(self._due <= self._clock))
         self._earliest_due = int(self._due.min())
 
     @abstractmethod
     def _change(self, plants: Indices) -> None:
-        """Change the values of the plants with the indices `plants`.
-
-        The method also sets the times of the next changes of these plants.
-        """
+        """Change the signal of the plants `plants`, and set the times of the next changes."""
 
 
 class SetPoint(_HeldSignal):
@@ -260,11 +249,7 @@ class SetPoint(_HeldSignal):
         self._places = np.zeros(num_envs, np.intp)
 
     def reset(self, plants: Indices, streams: StreamsOfPlants) -> Values:
-        """Begin an episode of the plants with the indices `plants`.
-
-        The result holds the set points y_d(0) of these plants, degC, shape (len(plants),).
-        `streams` holds the random number streams of all plants.
-        """
+        """Begin an episode of the plants `plants`, and return the set points y_d(0), degC."""
         self._streams = streams
         if self._levels.random:
             for i in plants.tolist():
@@ -276,7 +261,7 @@ class SetPoint(_HeldSignal):
         return self.present[plants]
 
     def ahead(self) -> list[float]:
-        """Return the next `SAMPLES_AT_A_TIME` set points, degC, for the only plant."""
+        """Return the next `SAMPLES_AT_A_TIME` set points of a single plant, degC."""
         level = self.present.item()
         place = self._places.item()
         known = self._earliest_due - self._clock - 1  # coming samples whose level is known
@@ -312,10 +297,11 @@ class SetPoint(_HeldSignal):
 class Disturbance(_HeldSignal):
     """The load disturbance w(k), degC: a level that jumps, plus a random walk.
 
-    The load changes every `LOAD_INTERVAL` samples. The level and the walk start at 0. At each
-    change, the level jumps with a probability of `LOAD_INTERVAL / disturbance_interval` to a
-    new level, uniform within +-`disturbance_amplitude`. At each change, the walk takes a random
-    step; the steps are uniform, but the sum of many steps is close to normal.
+    The load changes every `LOAD_INTERVAL` samples. The level and the random walk of the load
+    start at 0. At each change of the load, the level jumps with the probability `LOAD_INTERVAL
+    / disturbance_interval` to a new level that is uniform within +-`disturbance_amplitude`. At
+    each change of the load, the random walk takes a step with a uniform distribution; the sum
+    of many steps is approximately normal.
 
     Parameters
     ----------
@@ -340,9 +326,8 @@ class Disturbance(_HeldSignal):
     ) -> None:
         """Begin an episode of the plants with the indices `plants`, at load 0.
 
-        `numbers` holds the plant numbers of these plants, and `streams` the random number
-        streams of all plants. Each plant's stream `plant` must already have drawn the plant
-        numbers: the load continues this stream.
+        Before this call, the parameter values of the plants must have been sampled, because the
+        load uses the random numbers that follow in the stream `plant` of each plant.
         """
         self._streams = streams
         self._amplitudes[plants] = numbers.disturbance_amplitude
@@ -356,18 +341,19 @@ class Disturbance(_HeldSignal):
         self.present[plants] = 0.0
         self._due[plants] = self._clock + LOAD_INTERVAL
         self._earliest_due = int(self._due.min())
-        # Samples of the load that `ahead` returns first: 0 until the first change.
+        # Samples of the load that the next call of `ahead` returns first: 0 until the first
+        # change.
         self._surplus = [0.0] * (LOAD_INTERVAL - 1)
 
     def ahead(self) -> list[float]:
-        """Return the load at the next `SAMPLES_AT_A_TIME` samples, degC, for the only plant."""
+        """Return the load of a single plant at the next `SAMPLES_AT_A_TIME` samples, degC."""
         self._generate(ONLY_PLANT)  # as the load starts at 0, a few samples are left over
         samples = [*self._surplus, *np.repeat(self._loads[0], LOAD_INTERVAL).tolist()]
         self._surplus = samples[SAMPLES_AT_A_TIME:]
         return samples[:SAMPLES_AT_A_TIME]
 
     def _change(self, plants: Indices) -> None:
-        """Begin the next load of the plants with the indices `plants`."""
+        """Set the load of the plants with the indices `plants` to the next value."""
         needs_loads = self._next_columns[plants] == LOADS_AT_A_TIME
         self._generate(plants[needs_loads])
         columns = self._next_columns[plants]
@@ -376,7 +362,7 @@ class Disturbance(_HeldSignal):
         self._due[plants] += LOAD_INTERVAL
 
     def _generate(self, plants: Indices) -> None:
-        """Generate the next `LOADS_AT_A_TIME` loads of the plants with the indices `plants`."""
+        """Generate `LOADS_AT_A_TIME` load values for the plants with the indices `plants`."""
         for start in range(0, len(plants), PLANTS_AT_A_TIME):
             chunk = plants[start : start + PLANTS_AT_A_TIME]
             # For each load, three random numbers from 0 to 1: one for the step of the walk, one
@@ -390,10 +376,10 @@ class Disturbance(_HeldSignal):
         self._next_columns[plants] = 0
 
     def _continue_walks(self, plants: Indices, uniform: Values) -> Values:
-        """Return the walks of some plants at their next changes, degC.
+        """Return the random walks of some plants at the next changes of the load, degC.
 
-        `uniform` holds random numbers from 0 to 1. `uniform` and the result have the shape
-        (len(plants), changes).
+        `uniform`, which holds random numbers from 0 to 1, and the result have the shape
+        (len(plants), number of changes).
         """
         steps = (2.0 * uniform - 1.0) * self._largest_walk_steps[plants, np.newaxis]
         last_walks = self._last_walks[plants, np.newaxis]
@@ -404,16 +390,16 @@ class Disturbance(_HeldSignal):
     def _continue_levels(
         self, plants: Indices, jump_uniform: Values, level_uniform: Values
     ) -> Values:
-        """Return the levels of the load of some plants at their next changes, degC.
+        """Return the load levels of some plants at the next changes of the load, degC.
 
-        `jump_uniform` and `level_uniform` hold random numbers from 0 to 1, which decide whether
-        the level jumps, and to which level. The arguments and the result have the shape
-        (len(plants), changes).
+        `jump_uniform` holds random numbers from 0 to 1 that decide whether the level jumps, and
+        `level_uniform` random numbers from 0 to 1 that decide the new level. `jump_uniform`,
+        `level_uniform` and the result have the shape (len(plants), number of changes).
         """
         jumps = jump_uniform < self._jump_probabilities[plants, np.newaxis]
         new_levels = (2.0 * level_uniform - 1.0) * self._amplitudes[plants, np.newaxis]
-        # The level at a change is that of the latest jump up to this change. Column 0 is the
-        # level before the first of these changes, for the time until the first jump.
+        # The level at a change is the level of the latest jump up to this change. Column 0 of
+        # `candidates` is the last known level, which holds until the first jump.
         candidates = np.hstack((self._last_levels[plants, np.newaxis], new_levels))
         columns_of_jumps = np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0)
         columns_of_latest_jumps = np.maximum.accumulate(columns_of_jumps, axis=1)
@@ -423,7 +409,7 @@ class Disturbance(_HeldSignal):
 
 
 class Signals(NamedTuple):
-    """The external signals of some plants; None stands for a signal that is always 0."""
+    """The external signals of n plants; a field is None if the signal is always 0."""
 
     setpoint: SetPoint
     noise: Noise | None
@@ -453,18 +439,18 @@ class Signals(NamedTuple):
     ) -> Values:
         """Begin an episode of some plants, and return the set points y_d(0), degC.
 
-        The result has the shape (len(plants),). Noise, load disturbance and measurement noise
-        are 0 at k = 0.
+        The returned array has the shape (len(plants),). Noise, load disturbance and measurement
+        noise are 0 at sample k = 0.
 
         Parameters
         ----------
         plants
-            The indices of the plants that begin an episode.
+            Indices of the plants that begin an episode.
         streams
-            The random number streams of all plants, by index.
+            Random number streams of all plants, by index of the plant.
         numbers
-            The plant numbers of the episode: arrays of shape (len(plants),), or of shape () for
-            a number that all plants share.
+            Parameter values of the plants that begin an episode: arrays of shape
+            (len(plants),), or of shape () for a value that all plants share.
         """
         for signal in (self.noise, self.disturbance, self.measurement_noise):
             if signal is not None:
@@ -472,9 +458,9 @@ class Signals(NamedTuple):
         return self.setpoint.reset(plants, streams)
 
     def ahead(self) -> list[tuple[float, ...]]:
-        """Return the next `SAMPLES_AT_A_TIME` samples of the signals of the only plant.
+        """Return the next `SAMPLES_AT_A_TIME` samples of all signals of a single plant.
 
-        A sample is a tuple of set point y_d, noise n, load w and measurement noise, degC.
+        Each sample is a tuple of set point y_d, noise n, load w and measurement noise, in degC.
         """
         columns: list[list[float]] = []
         for signal in self:

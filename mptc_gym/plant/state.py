@@ -1,4 +1,4 @@
-"""Describe plants to a teacher in training, by quantities that a policy cannot observe."""
+"""Return quantities of plants that a policy cannot observe, for use in training."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mptc_gym.plant.parameters import Parameters, PlantNumbers, slowest_pole
 
 
 class PlantState(NamedTuple):
-    """The present state of n plants, for a teacher in training: a policy cannot observe it.
+    """Quantities of n plants that a policy cannot observe, for use in training.
 
-    The fields are NumPy arrays of float64, or PyTorch tensors of the environment's type and on
-    its device, of shape (n,).
+    Each field is a NumPy array of float64, or a PyTorch tensor with the environment's data type
+    and on the environment's device, of shape (n,).
     """
 
     delay: Any  # samples
@@ -31,19 +31,19 @@ def plant_state(
 ) -> PlantState:
     """Return delay, dead zone, gain, time constant and load of n plants at the present sample.
 
-    Each field of the result has the shape (n,), and the library and type of `load`.
+    Each field of the result has the shape (n,), and is an array or tensor like `load`.
 
     Parameters
     ----------
     parameters
         The arguments of the environment.
     numbers
-        The plant numbers that the latest resets sampled for the arguments that are ranges, by
-        name, shape (n,).
+        Parameter values that the latest resets sampled for the arguments that are ranges:
+        arrays or tensors of shape (n,), by name of the argument.
     ages
-        The present sample k of each plant's episode, shape (n,).
+        Number of samples since the start of each plant's episode, shape (n,).
     load
-        The load disturbance w(k) of each plant, degC, shape (n,).
+        Load disturbance w(k) of each plant, degC, shape (n,).
     """
     plants: PlantNumbers[Any] = replace(parameters.lowest, **numbers)
     # Drifting dynamics change only at samples that are multiples of `DRIFT_INTERVAL`.
@@ -60,18 +60,15 @@ def plant_state(
 
 
 def _nominal_gain(parameters: Parameters) -> float:
-    """Return the steady-state gain B(1) / A(1), degC per t/h, or infinity if A(1) is 0.
-
-    A and B are the polynomials of equation (28) of the paper.
-    """
+    """Return the steady-state gain of the polynomials `a` and `b`, degC per t/h, or inf."""
     denominator = sum(parameters.a)
     return sum(parameters.b) / denominator if denominator else math.inf
 
 
 def _nominal_time_constant(parameters: Parameters) -> float:
-    """Return the time constant of the plant's slowest pole p, 1 / (1 - p) samples, in seconds.
+    """Return the dominant time constant in s: 1 / (1 - p) samples for the slowest pole p.
 
-    The result is NaN unless the slowest pole is real and between 0 and 1.
+    The returned time constant is NaN unless the slowest pole is real and between 0 and 1.
     """
     pole = slowest_pole(parameters.a)
     if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
