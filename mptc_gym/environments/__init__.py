@@ -1,7 +1,7 @@
-"""Serve environments of every kind: one plant or many, in NumPy or PyTorch, wrapped or not.
+"""Make, inspect, record and draw environments, with or without wrappers.
 
-- `making` makes environments from ids and specs (`EnvSpec`).
-- `batch` is the base class of the vector environments in NumPy and PyTorch.
-- `layers` looks into wrapped environments.
-- `record` keeps the latest samples of an episode, and `drawing` draws them.
+- `making` makes environments from environment ids and from Gymnasium's `EnvSpec`.
+- `batch` has the base class of the vector environments in NumPy and PyTorch.
+- `layers` finds the plants and the wrappers in an environment.
+- `record` stores the latest samples of an episode, and `drawing` draws a picture of a record.
 """

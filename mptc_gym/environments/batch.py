@@ -1,7 +1,8 @@
-"""Handle arguments, resets, time limits and infos, in NumPy and PyTorch environments alike.
+"""Define the base class of the vector environments in NumPy and PyTorch.
 
-A mask is an array of bool that selects plants. `MiddlePointVectorEnv` adds plants in NumPy
-arrays, and `MiddlePointTorchEnv` adds plants in PyTorch tensors.
+`BatchEnv` handles arguments, resets, time limits and infos. `MiddlePointVectorEnv` implements
+the plants with NumPy, and `MiddlePointTorchEnv` with PyTorch. A mask is a bool array, shape
+(num_envs,), which is True for the selected plants.
 """
 
 from __future__ import annotations
@@ -30,28 +31,29 @@ Mask = NDArray[np.bool_]  # True for the selected plants, shape (num_envs,)
 
 
 class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
-    """n plants that advance together: the part that does not depend on NumPy or PyTorch.
+    """Base class of the environments that step n plants at once, in NumPy or in PyTorch.
 
     Parameters
     ----------
     num_envs
         Number n of plants.
     max_episode_steps
-        Samples after which an episode is truncated; None or -1 for no limit.
+        Number of samples after which an episode is truncated; None or -1 means no limit.
     autoreset_mode
-        An `AutoresetMode` or its value: when the plant of an ended episode is reset.
+        When to reset a plant whose episode has ended: an `AutoresetMode` of Gymnasium, or the
+        value of an `AutoresetMode`, such as "NextStep".
     arguments
-        The arguments of the plants, by name.
+        Keyword arguments of `MiddlePointEnv`, by name, except `render_mode`.
 
     Attributes
     ----------
     _where : callable
-        `numpy.where` or `torch.where`; set by a subclass.
+        The function `numpy.where` or `torch.where`, which a subclass sets.
     _window
-        The object that stores the observations; set by a subclass. `_window.present()` returns
-        a copy of the present observations, shape (num_envs, size).
+        The object that stores the observations, which a subclass of `BatchEnv` sets.
+        `_window.present()` returns a copy of the present observations, shape (num_envs, size).
     _zeros : array
-        Zeros, shape (num_envs,), which nobody modifies; set by a subclass.
+        Constant zeros, shape (num_envs,), in an array or a tensor that a subclass sets.
     """
 
     _where: Any
@@ -102,31 +104,33 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, Infos]:
-        """Bring all or some plants to rest and start an episode of each.
+        """Bring all or some plants to rest, and begin an episode of each of these plants.
 
         Parameters
         ----------
         seed
-            Restarts the random number streams; see the docstring of the class. Without a seed,
-            the next episodes continue the present streams.
+            Seed that restarts the random number streams, as the docstring of the class
+            describes. Without a seed, the random number streams continue.
         options
             `reset_mask`, a bool array of shape (num_envs,), selects the plants to reset. The
-            first reset must include all plants. `MiddlePointTorchEnv` also takes `signals`.
-            Other options are ignored, as in Gymnasium's environments.
+            first reset of an environment must include all plants. `MiddlePointTorchEnv` takes a
+            second option, `signals`. Unknown options are ignored, as in Gymnasium's
+            environments.
 
         Returns
         -------
         observations : array
-            The observations, shape (num_envs, size). The row of a plant that is not reset is
-            the plant's last observation.
+            The observations, shape (num_envs, size). For a plant that is not reset, the row
+            holds the plant's last observation.
         infos : dict
-            The infos, in arrays of shape (num_envs,), and the masks of the infos, which are
-            False for plants that are not reset. Masks of several infos may be one array.
+            Infos by name, and the mask of the info `name` under `_name`, in arrays of shape
+            (num_envs,). The masks are False for plants that are not reset. Several infos may
+            share one array as their mask.
 
         Raises
         ------
         ValueError
-            If an argument is invalid. The error leaves the environment unchanged.
+            If an argument is invalid. A ValueError leaves the environment unchanged.
         ResetNeeded
             If the first reset does not include all plants.
         """
@@ -141,29 +145,31 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         return self._window.present(), infos
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Infos]:
-        """Apply normalised actions for one sample.
+        """Apply one normalised action to each plant for one sample.
 
         Parameters
         ----------
         actions
-            The actions a(k), shape (num_envs, 1): -1 commands the flow `u_min`, 1 `u_max`.
+            Actions a(k), shape (num_envs, 1): -1 commands the flow `u_min`, and 1 commands
+            `u_max`.
 
         Returns
         -------
         observations : array
             The observations at sample k+1, shape (num_envs, size).
         rewards, terminations, truncations : array
-            The rewards of the errors e(k+1), and the flags of ended episodes, shape
-            (num_envs,). No episode terminates; the time limit truncates episodes.
+            Rewards for the control errors e(k+1), and flags of episodes that have terminated or
+            were truncated, each of shape (num_envs,). No episode terminates; the time limit
+            truncates episodes.
         infos : dict
-            The infos at sample k+1, in arrays of shape (num_envs,), and the masks of the infos.
-            Masks of several infos may be one array.
+            Infos at sample k+1 by name, and the mask of the info `name` under `_name`, in
+            arrays of shape (num_envs,). Several infos may share one array as their mask.
 
         Raises
         ------
         ValueError
-            If the actions have another shape or are not finite. The error leaves the
-            environment unchanged.
+            If the actions do not have the shape (num_envs, 1), or if an action is not finite. A
+            ValueError leaves the environment unchanged.
         ResetNeeded
             If `step` is called before the first `reset`; with the autoreset mode "Disabled",
             also if an episode has ended and its plant was not reset.
@@ -175,7 +181,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             ended_plants = np.flatnonzero(reset_now)
             raise ResetNeeded(f"reset environments {ended_plants}, whose episodes have ended")
         a = self._checked_actions(actions)
-        if reset_now is not None and reset_now.all():  # no plant moves
+        if reset_now is not None and reset_now.all():  # no plant advances
             infos = self._begin_episodes(reset_now, {})
             rewards = self._zeros + 0.0  # a copy, as the caller may overwrite the rewards
             terminations = self._as_array(~reset_now)
@@ -201,9 +207,10 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         return observations, rewards, terminations, truncations, infos
 
     def _add_final(self, ended: Mask, observations: Array, infos: Infos) -> None:
-        """Add `final_obs` and `final_info` of the plants in `ended` to the infos of a step.
+        """Add `final_obs` and `final_info` to the infos of a step for the plants in `ended`.
 
-        `observations`, shape (num_envs, size), and `infos` are the last of the ended episodes.
+        `observations`, shape (num_envs, size), and `infos` hold the last observation and the
+        last infos of each episode that has ended. `ended` is a mask.
         """
         flags = self._as_array(ended)
         final_info: Infos = {}
@@ -216,15 +223,10 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         infos["_final_obs"] = flags
 
     def _begin_episodes(self, mask: Mask, infos: Infos) -> Infos:
-        """Begin an episode of some plants, and return infos with sample k = 0 of these plants.
+        """Begin an episode of each plant in `mask`, and return infos at sample k = 0.
 
-        Parameters
-        ----------
-        mask
-            The plants.
-        infos
-            The infos of a step, or an empty dict, filled in place and returned. The elements of
-            plants outside `mask` stay the same.
+        The dict `infos` holds the infos of a step, or is empty. `infos` is changed in place and
+        returned; the elements of plants outside `mask` do not change.
         """
         self._starts[mask] = self._clock
         self._next_end = int(self._starts.min()) + self._episode_length
@@ -240,10 +242,11 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         return infos
 
     def plant_state(self) -> PlantState:
-        """Return the present state of the plants, which no policy can observe.
+        """Return the hidden state of the plants at the present sample.
 
-        In training, a critic or a teacher may use the state. The state belongs to the same
-        sample as the observations that `step` or `reset` has just returned.
+        Observations do not contain the hidden state, but a critic or a teacher policy may use
+        the hidden state in training. The hidden state belongs to the same sample as the latest
+        observations of `step` or `reset`.
 
         Returns
         -------
@@ -264,9 +267,10 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         return plant_state(self.parameters, numbers, ages, load)
 
     def _checked_mask(self, options: Mapping[str, Any]) -> Mask:
-        """Return the mask of the plants to reset: `options["reset_mask"]`, or else all plants.
+        """Return the mask of the plants to reset: `options["reset_mask"]`, or all plants.
 
-        A ValueError is raised if the mask is not an array of bool with at least one True.
+        A ValueError is raised if `reset_mask` is not a bool array of shape (num_envs,) with at
+        least one True.
         """
         if "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
@@ -285,50 +289,52 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
 
     @abstractmethod
     def _as_array(self, values: NDArray[Any]) -> Array:
-        """Return a NumPy array of shape (num_envs,) as a new array of NumPy or PyTorch."""
+        """Copy a NumPy array, shape (num_envs,), to a new NumPy array or PyTorch tensor."""
 
     @abstractmethod
     def _hidden_state(self) -> tuple[dict[str, Array], Array]:
-        """Return the plant numbers and loads that `plant_state` needs, shape (num_envs,).
+        """Return the drawn parameter values and the loads of the plants, for `plant_state`.
 
         Returns
         -------
         numbers : dict of array
-            The numbers that were drawn for arguments that are ranges, by name.
+            Values that were drawn for arguments that are ranges, by the name of the argument,
+            shape (num_envs,).
         load : array
-            The load w at the present sample, degC.
+            Loads w at the present sample, degC, shape (num_envs,).
         """
 
     @abstractmethod
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Check the seed and the options of a `reset` of the plants in `mask`, and apply both.
 
-        An invalid seed or option raises a ValueError.
+        A ValueError is raised if the seed or an option is invalid.
         """
 
     @abstractmethod
     def _begin(self, mask: Mask) -> dict[str, Array]:
-        """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
+        """Begin an episode of each plant in `mask`, and return infos at sample k = 0.
 
-        Infos that are always 0 at k = 0 are left out. The infos are arrays of shape
-        (num_envs,), in which elements of other plants have no meaning.
+        The returned dict lacks infos that are always 0 at k = 0, such as `output`. Every info
+        is an array of shape (num_envs,), whose elements for plants outside `mask` have no
+        meaning.
         """
 
     @abstractmethod
     def _checked_actions(self, actions: Any) -> Array:
         """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended.
 
-        Actions of a shape other than (num_envs, 1) and actions that are not finite raise a
-        ValueError.
+        A ValueError is raised if the actions do not have the shape (num_envs, 1), or if an
+        action is not finite.
         """
 
     @abstractmethod
     def _advance(self, a: Array) -> tuple[Array, Array, Array, Array, Infos]:
-        """Move all plants by one sample, and return what `step` returns if no episode ends.
+        """Advance all plants by one sample, and return what `step` returns if no episode ends.
 
-        `a` are the checked actions, shape (num_envs,).
+        `a` holds the actions that `_checked_actions` returned, shape (num_envs,).
         """
 
     @abstractmethod
     def _final_observations(self, ended: Mask, observations: Array) -> Array:
-        """Return the rows of observations, shape (num_envs, size), of the plants in `ended`."""
+        """Return the rows of `observations`, shape (num_envs, size), of plants in `ended`."""

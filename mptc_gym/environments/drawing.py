@@ -41,7 +41,7 @@ viewers: WeakSet[object] = WeakSet()  # environments that show pictures in the w
 
 
 class Label(NamedTuple):
-    """A text above a panel, as in the legend of a diagram."""
+    """A legend text above a panel of the picture."""
 
     text: str
     colour: Colour
@@ -49,7 +49,7 @@ class Label(NamedTuple):
 
 
 class Panel:
-    """A diagram in the picture: samples of a record on an axis of time, in minutes.
+    """One diagram of the picture, which plots samples of a record over time in minutes.
 
     Parameters
     ----------
@@ -58,9 +58,9 @@ class Panel:
     record
         The samples to draw.
     rectangle
-        Where the panel is in the picture, pixels.
+        Position and size of the panel in the picture, pixels.
     axis
-        The lower and the upper end of the vertical axis, degC or t/h.
+        Lower end and upper end of the vertical axis, degC or t/h.
     """
 
     def __init__(
@@ -84,8 +84,8 @@ class Panel:
     def y(self, value: float) -> float:
         """Return the vertical position of a value, pixels from the picture's upper edge.
 
-        `value` has the unit of the vertical axis, degC or t/h. The position of a value beyond
-        the axis is at the edge of the panel.
+        `value` has the unit of the vertical axis, degC or t/h. For a value beyond the axis, the
+        position is at the edge of the panel.
         """
         low, high = self._axis
         below_top = (high - value) / (high - low) * self._rectangle.height
@@ -94,7 +94,7 @@ class Panel:
         return self._rectangle.top + max(3.0, min(self._rectangle.height - 3.0, below_top))
 
     def grid(self) -> None:
-        """Draw the grid and the frame of the panel, and write the numbers of both axes."""
+        """Draw the panel's grid lines and frame, and write the tick labels of both axes."""
         rectangle = self._rectangle
         for value in ticks(*self._axis):
             self.horizontal_line(_GRID, value)
@@ -106,17 +106,17 @@ class Panel:
             x = self.x(minutes * samples_per_minute)
             pygame.draw.line(self._surface, _GRID, (x, rectangle.top), (x, rectangle.bottom))
             self.write(f"{minutes:.6g}", _TEXT, midtop=(x, rectangle.bottom + 6))
-        # The unit of the time axis stands so far left that no number of the axis meets it.
+        # The unit of the time axis is so far left that no tick label overlaps the unit.
         self.write("min", _TEXT, topright=(rectangle.left - 34, rectangle.bottom + 6))
         size_of_frame = rectangle.width + 1, rectangle.height + 1
         frame_of_panel = pygame.Rect(rectangle.topleft, size_of_frame)
         pygame.draw.rect(self._surface, LIMIT, frame_of_panel, width=1)
 
     def shade(self, colour: Colour, first: int, last: int, low: float, high: float) -> None:
-        """Shade the area from sample `first` to sample `last`, and from value `low` to `high`.
+        """Shade the panel from sample `first` to `last`, and from the value `low` to `high`.
 
-        The values have the unit of the vertical axis. The colours of the picture are multiplied
-        by `colour`, so that lines under the area stay visible.
+        `low` and `high` have the unit of the vertical axis, degC or t/h. Multiplying the
+        colours of the picture by `colour` keeps lines under the shading visible.
         """
         left = max(self._rectangle.left, round(self.x(first)))
         right = round(self.x(last))
@@ -135,20 +135,11 @@ class Panel:
     def curve(
         self, colour: Colour, values: Sequence[float], width: int, *, is_staircase: bool
     ) -> None:
-        """Draw a curve through the values of the latest samples.
+        """Draw a curve of `values`, one for each of the latest samples, the newest last.
 
-        Parameters
-        ----------
-        colour
-            Colour of the curve.
-        values
-            One value for each of the latest samples, the newest last, in the unit of the
-            vertical axis.
-        width
-            Width of the line, pixels.
-        is_staircase
-            Whether each value holds until the next sample; otherwise, straight lines join the
-            values.
+        `values` have the unit of the vertical axis, degC or t/h. `width` is the line width in
+        pixels. With `is_staircase`, each value holds until the next sample; otherwise, straight
+        lines join the values.
         """
         first = self._record.k + 1 - len(values)
         points: list[tuple[float, float]] = []
@@ -178,15 +169,9 @@ class Panel:
     ) -> pygame.Rect:
         """Write a text into the picture, and return the rectangle that the text fills, pixels.
 
-        Parameters
-        ----------
-        text
-            The text, whose hyphens are written as minus signs.
-        colour, background
-            Colour of the text, and colour behind the text.
-        **anchor
-            The position of one point of the rectangle, by pygame's name of the point, as in
-            `midleft=(x, y)`, pixels from the picture's upper left corner.
+        A minus sign replaces every hyphen in `text`. `anchor` is the position of one point of
+        the rectangle, by pygame's name of that point, as in `midleft=(x, y)`, in pixels from
+        the picture's upper left corner.
         """
         minus_sign = "\N{MINUS SIGN}"
         image = self._font.render(text.replace("-", minus_sign), True, colour, background)
@@ -196,7 +181,7 @@ class Panel:
 
 
 def draw(record: Record) -> pygame.Surface:
-    """Return a picture of a record, 960 pixels wide and 540 pixels high."""
+    """Draw a record, and return the picture, 960 pixels wide and 540 pixels high."""
     pygame.font.init()
     # The bytes of a pixel are in the order red, green, blue, as in the arrays of `frame`.
     surface = pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
@@ -207,7 +192,7 @@ def draw(record: Record) -> pygame.Surface:
 
 
 def _draw_temperatures(surface: pygame.Surface, record: Record) -> None:
-    """Draw the upper panel of a record on a surface: temperature and set point, degC."""
+    """Draw the upper panel of the picture: temperature and set point, degC."""
     panel = Panel(surface, record, TEMPERATURES, record.temperature_axis)
     panel.grid()
     panel.curve(
@@ -227,9 +212,9 @@ def _draw_temperatures(surface: pygame.Surface, record: Record) -> None:
 
 
 def _draw_flows(surface: pygame.Surface, record: Record) -> None:
-    """Draw the lower panel of a record on a surface: flows, t/h, limits and dead zone.
+    """Draw the lower panel of the picture: flows, limits and dead zone, t/h.
 
-    The time in which an applied flow has not yet reached the middle point is shaded.
+    The newest flows, which do not affect the temperature yet because of the delay, are shaded.
     """
     plant = record.plant
     panel = Panel(surface, record, FLOWS, record.flow_axis)
@@ -256,23 +241,24 @@ def _draw_flows(surface: pygame.Surface, record: Record) -> None:
 
 
 def frame(record: Record) -> NDArray[np.uint8]:
-    """Return a picture of a record, uint8, shape (540, 960, 3): rows, columns, RGB."""
+    """Return a picture of a record: uint8, shape (540, 960, 3), for rows, columns, RGB."""
     return np.array(pygame.surfarray.pixels3d(draw(record)).swapaxes(0, 1), order="C")
 
 
 def show(record: Record, fps: float, viewer: object) -> None:
-    """Show a picture of a record in the window, which is opened if necessary.
+    """Show a picture of a record in the window, which `show` opens if necessary.
 
-    All environments share the window, which stays open until each of them has called `hide`.
+    All environments share one window, which closes when every environment has called `hide`.
 
     Parameters
     ----------
     record
         The samples to draw.
     fps
-        Most pictures per second: the function waits if the latest picture is too recent.
+        Maximum number of pictures per second: `show` waits if the previous picture is too
+        recent.
     viewer
-        The environment that shows the picture.
+        Environment whose record is shown.
     """
     viewers.add(viewer)
     pygame.display.init()
@@ -287,16 +273,16 @@ def show(record: Record, fps: float, viewer: object) -> None:
 
 
 def hide(viewer: object) -> None:
-    """Close the window, unless another environment than `viewer` shows pictures there."""
+    """Close the window unless an environment other than `viewer` still uses the window."""
     viewers.discard(viewer)
     if not viewers:
         pygame.display.quit()
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return the 3 to 7 numbers to write on an axis from `low` to `high`.
+    """Return 3 to 7 tick values for an axis from `low` to `high`.
 
-    The numbers are the multiples of 1, 2 or 5 times a power of ten.
+    The tick values are multiples of a step, which is 1, 2 or 5 times a power of ten.
     """
     smallest_step = (high - low) / 6.0
     power = 10.0 ** math.floor(math.log10(smallest_step))
@@ -306,7 +292,7 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def _two_decimals(value: float) -> str:
-    """Return a number as text with two decimals, never "-0.00"; from 1e5 on, three digits."""
+    """Format a number with two decimals, never "-0.00", or as in 1.23e+05 from 1e5 on."""
     if abs(value) < 1e5:
         return f"{round(value, 2) + 0.0:.2f}"  # adding 0.0 turns -0.0 into 0.0
     return f"{value:.3g}"

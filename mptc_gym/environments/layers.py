@@ -1,4 +1,4 @@
-"""Find the layers of an environment of any kind, its plants and its wrappers.
+"""Find the plants and the wrappers in an environment of any kind.
 
 A layer is one of the objects that form an environment: a wrapper, a vector environment or an
 innermost environment.
@@ -35,7 +35,7 @@ _NEUTRAL: Final = frozenset({
 
 
 class PlantGroup(NamedTuple):
-    """Plants with the same arguments and wrappers: one environment, or one batch of plants."""
+    """Description of one environment, or of one batch of plants with equal arguments."""
 
     parameters: Parameters
     num_envs: int
@@ -45,29 +45,30 @@ class PlantGroup(NamedTuple):
 
 
 def loaded(name: str) -> Any:
-    """Return the class with the full name `name`, or () if its module has not been imported.
+    """Return the class with the full name `name`, or () if the module is not imported.
 
-    As `isinstance(object, ())` is False, objects of an optional package can be recognised
-    without importing the package.
+    Since `isinstance(env, ())` is False, a caller can test for a class of an optional package
+    without importing that package.
     """
     module, _, class_name = name.rpartition(".")
     return getattr(sys.modules.get(module), class_name, ())
 
 
 def is_environment(env: Any) -> bool:
-    """Whether `env` is an `Env` or `VectorEnv` of Gymnasium, or a `VecEnv` of SB3."""
+    """Return whether `env` is an `Env` or `VectorEnv` of Gymnasium, or a `VecEnv` of SB3."""
     return isinstance(env, (gymnasium.Env, VectorEnv, loaded(f"{VEC_ENV}.VecEnv")))
 
 
 def runs_processes(layer: Any) -> bool:
-    """Whether a layer runs its inner environments in other processes."""
+    """Return whether `layer` runs environments in worker processes."""
     return isinstance(layer, (AsyncVectorEnv, loaded(f"{VEC_ENV}.SubprocVecEnv")))
 
 
 def normaliser_flag(layer: Any) -> str:
-    """Return the name of the attribute that switches a normaliser's updates on and off.
+    """Return the name of the attribute that enables the updates of a normalising wrapper.
 
-    The result is "" if `layer` does not normalise observations or rewards by statistics.
+    The name is "" if `layer` does not normalise observations or rewards by
+    running statistics.
     """
     if isinstance(layer, loaded(f"{VEC_ENV}.VecNormalize")):
         return "training"
@@ -77,7 +78,7 @@ def normaliser_flag(layer: Any) -> str:
 
 
 def inner_environments(env: Any) -> list[Any]:
-    """Return the environments directly within `env`, except those in other processes."""
+    """Return the environments directly inside `env`, without those in worker processes."""
     inner: list[Any] = []
     for name in INNER:
         value = vars(env).get(name)
@@ -94,21 +95,21 @@ def layers(env: Any) -> Iterator[Any]:
 
 
 def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
-    """Return descriptions of the plants in an environment, also of those in other processes.
+    """Return descriptions of the plants in `env`, including plants in worker processes.
 
     Parameters
     ----------
     env
         An environment of any kind.
     outer
-        The names of the wrappers around `env`, outermost first.
+        Class names of the wrappers around `env`, the outermost first.
 
     Returns
     -------
     list of PlantGroup
-        One element for each environment or batch of plants, in the order of the plants. The
-        list is empty if `env` holds no plants of this package in NumPy, or if the processes of
-        `env` are closed.
+        One `PlantGroup` for each environment or batch of plants, in the order of the plants.
+        The list is empty if `env` holds no plants of this package in NumPy, or if the worker
+        processes of `env` are closed.
     """
     wrappers = outer
     if _changes_policy(env):
@@ -131,7 +132,7 @@ def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
 
 
 def _changes_policy(layer: Any) -> bool:
-    """Whether a layer is a wrapper that may change observations or actions of a policy."""
+    """Return whether `layer` is a wrapper that may change observations or actions."""
     reward_wrappers = gymnasium.RewardWrapper, gymnasium.vector.VectorRewardWrapper
     if type(layer).__name__ in _NEUTRAL or isinstance(layer, reward_wrappers):
         return False
@@ -142,36 +143,27 @@ def _changes_policy(layer: Any) -> bool:
 
 
 def ask_processes(env: Any, method: str, *arguments: Any) -> list[Any]:
-    """Call a method of each environment in other processes, and return the results.
+    """Call a method of the environment in each worker process, and return the results.
 
-    An environment without the method, or with a result that cannot be pickled, ends its
-    process.
-
-    Parameters
-    ----------
-    env
-        An `AsyncVectorEnv` of Gymnasium or a `SubprocVecEnv` of Stable-Baselines3.
-    method
-        Name of the method to call.
-    *arguments
-        Arguments of the method.
+    `env` is an `AsyncVectorEnv` of Gymnasium or a `SubprocVecEnv` of Stable-Baselines3. A
+    worker process ends if its environment lacks the method, or if the result cannot be pickled.
     """
     call_each = getattr(env, "env_method", None) or env.call
     return list(call_each(method, *arguments))
 
 
 def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
-    """Return the plants in the processes of `env`, as `plant_groups` does.
+    """Return descriptions of the plants in the worker processes of a vector environment.
 
-    `outer` holds the names of the wrappers around `env`. The result is [] if the processes are
-    closed.
+    `outer` holds the class names of the wrappers around `env`, the outermost first. The list is
+    empty if the worker processes are closed, or if an environment is from another package.
     """
     try:
         texts = ask_processes(env, "__str__")
         if not all(ask_processes(env, "has_wrapper_attr", "parameters")):
             return []
         parameters = env.get_attr("parameters")
-    except Exception:  # whatever closed or broken processes raise
+    except Exception:  # closed or broken processes raise various errors
         return []
     groups = []
     for text, parameters_of_plant in zip(texts, parameters, strict=True):

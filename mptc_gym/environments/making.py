@@ -1,4 +1,4 @@
-"""Make environments from ids and specs (`EnvSpec`): one environment, or many in one batch."""
+"""Make one environment from an id or an `EnvSpec`, or many such environments in a batch."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Env = gymnasium.Env[Any, Any]
 
 
 def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
-    """Make one environment by `gymnasium.make`, without Gymnasium's environment checker.
+    """Make one environment with `gymnasium.make`, without Gymnasium's environment checker.
 
     Parameters
     ----------
     env
-        An id such as "MiddlePoint-v0", or an `EnvSpec`.
+        Environment id, such as "MiddlePoint-v0", or an `EnvSpec`.
     arguments
-        Further arguments of `gymnasium.make`, by name.
+        Keyword arguments of `gymnasium.make`, by name.
 
     Raises
     ------
     ValueError
-        If the environment cannot be found, or an argument is out of range.
+        If the environment `env` cannot be found, or if a value in `arguments` is out of range.
     """
     try:
         return gymnasium.make(env, **{"disable_env_checker": True, **arguments})
@@ -42,23 +42,23 @@ def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
 
 
 def make_batch(single: Env, n: int, **modes: Any) -> Any:
-    """Return n environments like `single` in one batch, or None if no batch can hold them.
+    """Return a vector environment of n environments like `single`, or None.
 
     Parameters
     ----------
     single
-        An environment from `gymnasium.make`, wrapped or not.
+        Environment from `gymnasium.make`, with or without wrappers.
     n
         Number of environments.
     **modes
-        The `render_mode` and the `autoreset_mode` of the vector environment.
+        Values of `render_mode` and `autoreset_mode` for the vector environment.
 
     Returns
     -------
     VectorEnv or None
-        A `MiddlePointVectorEnv`, wrapped as `single`. None if `single` is not a
-        `MiddlePointEnv`, or has a wrapper other than `IncrementalAction` and the wrappers of
-        `gymnasium.make`.
+        A `MiddlePointVectorEnv` with the wrappers of `single`. None if `single` is not a
+        `MiddlePointEnv`, or if `single` has a wrapper other than `IncrementalAction` and the
+        wrappers of `gymnasium.make`.
     """
     spec = single.spec
     plant = single.unwrapped

@@ -1,6 +1,7 @@
 """Record the latest samples of an episode, from which pictures are drawn.
 
-A record holds only numbers, so that an environment can be copied together with its record.
+A record holds only numbers and no pygame objects, so that an environment can be copied together
+with its record.
 """
 
 from collections import deque
@@ -8,8 +9,8 @@ from typing import NamedTuple
 
 from mptc_gym.plant.parameters import PlantNumbers
 
-FEWEST_SAMPLES = 200  # of a picture's width: some 27 minutes of 8 s samples
-MOST_SAMPLES = 2000  # of a picture's width, even where four delays are longer
+FEWEST_SAMPLES = 200  # in a picture, about 27 minutes of 8 s samples
+MOST_SAMPLES = 2000  # in a picture, even if four delays are longer
 FARTHEST = 1e12  # degC; temperatures beyond +-FARTHEST, and NaN, are drawn at the edge
 
 
@@ -23,31 +24,31 @@ class Sample(NamedTuple):
 
 
 class Record:
-    """The latest samples of an episode, and the axes of a picture of these samples.
+    """Latest samples of an episode, with the axis limits for a picture of these samples.
 
     Attributes
     ----------
     plant : PlantNumbers
-        The plant numbers of the episode, such as delay, dead zone and limits.
+        Parameter values of the plant in this episode, such as delay, dead zone and limits.
     sampling_interval : float
         Sampling interval, s.
     span : int
-        Samples between the left and the right edge of a picture.
+        Number of samples between the left edge and the right edge of a picture.
     flow_axis : tuple of float
-        The ends of the flow axis, t/h: the range of the actuator, widened to include 0, with a
-        margin of 12 % at each end.
+        Lower end and upper end of the flow axis, t/h. The axis includes the actuator's limits
+        and 0, with a margin of 12 % at each end.
     samples : deque of Sample
-        The latest samples, at most `span` + 1, the newest last.
+        Latest samples of the episode, at most `span` + 1, the newest last.
     k : int
-        The index of the newest sample.
+        Sample number of the newest sample.
     first : int
-        The index of the sample at the left edge of a picture.
+        Sample number at the left edge of a picture.
     """
 
     def __init__(
         self, plant: PlantNumbers[float], sampling_interval: float, setpoint: float
     ) -> None:
-        """Begin the record at k = 0, with the set point `setpoint`, degC.
+        """Begin the record at sample k = 0, with the set point `setpoint`, degC.
 
         Temperature and flows are 0 at k = 0.
         """
@@ -86,6 +87,6 @@ class Record:
 
     @property
     def temperature_axis(self) -> tuple[float, float]:
-        """The ends of the temperature axis, degC: extremes of the episode, with a margin."""
+        """Ends of the temperature axis, degC: the episode's extremes, with a margin."""
         margin = max(0.05 * (self._highest - self._lowest), 0.5)
         return self._lowest - margin, self._highest + margin

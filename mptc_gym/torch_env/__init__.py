@@ -1,9 +1,9 @@
-"""Simulate many plants side by side in PyTorch, on any device, optionally with gradients.
+"""Simulate many plants at once in PyTorch, on any device, optionally with gradients.
 
-- `env` is the environment, `MiddlePointTorchEnv`.
-- `episodes` keeps what every plant has of its own: its sample number and its plant numbers.
+- `env` has the environment, `MiddlePointTorchEnv`.
+- `episodes` keeps the sample number and the parameter values of every plant.
 - `signals` generates set points, noise and loads.
-- `plant` moves the plants, a block of samples at a time.
+- `plant` computes the temperatures, a block of successive samples at a time.
 - `window` stores the observations.
 """
 

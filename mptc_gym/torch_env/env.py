@@ -1,4 +1,4 @@
-"""Simulate many plants side by side in PyTorch, on any device, optionally with gradients."""
+"""Simulate many plants at once in PyTorch, on any device, optionally with gradients."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ from mptc_gym.torch_env.plant import TorchPlants
 from mptc_gym.torch_env.signals import make_signals
 from mptc_gym.torch_env.window import Window
 
-# Most numbers in a block of a signal on a CPU: 512 KiB of float32, which fit in the cache.
+# Maximum number of values in a block of a signal on a CPU: 512 KiB of float32 fit in the cache.
 _NUMBERS_IN_CACHE = 1 << 17
 
 
 class _Step(NamedTuple):
-    """What `step` will return for a sample, as far as known before the action of the step."""
+    """Results of one future `step` that do not depend on the action of that step."""
 
     rewards: Tensor  # without the cost of moves, shape (n,)
     terminations: Tensor  # shape (n,)
@@ -58,40 +58,41 @@ class _Step(NamedTuple):
 
 
 class MiddlePointTorchEnv(BatchEnv):
-    """n plants that advance together, with observations, actions and rewards in tensors.
+    """Vector environment of n plants, with PyTorch tensors as observations and actions.
 
-    The plant, the spaces, the reward, the infos and the arguments are those of
-    `MiddlePointEnv`; the resets are those of `MiddlePointVectorEnv`. With the same signals and
-    actions, `MiddlePointTorchEnv` and `MiddlePointVectorEnv` return the same values up to
+    `MiddlePointTorchEnv` has the plant, the spaces, the reward, the infos and the arguments of
+    `MiddlePointEnv`, and resets plants as `MiddlePointVectorEnv` does. With the same signals
+    and actions, `MiddlePointTorchEnv` and `MiddlePointVectorEnv` return the same values up to
     rounding.
 
-    Use `MiddlePointTorchEnv` to train on a GPU, on thousands of noisy plants, or by gradients
-    through the plant. On a CPU, few plants run faster in NumPy:
+    Use `MiddlePointTorchEnv` to train on a GPU, on thousands of noisy plants, or with gradients
+    through the plant. On a CPU, a small number of plants runs faster in NumPy, with
     `gymnasium.make_vec("MiddlePoint-v0", num_envs=n)`.
 
     Parameters
     ----------
     num_envs, max_episode_steps, autoreset_mode
-        See `MiddlePointVectorEnv`. In `MiddlePointTorchEnv`, `final_obs` is a tensor, with
+        As in `MiddlePointVectorEnv`. In `MiddlePointTorchEnv`, `final_obs` is a tensor, with
         zeros for plants whose episode has not ended.
     device
-        Device of all computations and tensors.
+        PyTorch device of all computations and tensors.
     dtype
-        torch.float32 or torch.float64: the type of all computations and of the observations.
-        The spaces are always float32.
+        Type of all computations and of the observations: torch.float32 or torch.float64. The
+        action space and the observation space are always float32.
     differentiable
-        Whether observations, rewards and infos carry PyTorch's gradient graph back to the
-        actions of the present and of earlier steps; see the note on gradients.
+        Whether observations, rewards and infos have gradients with respect to the actions of
+        the present step and of earlier steps.
     **arguments
-        The arguments of `MiddlePointEnv` except `render_mode`. All plants have the same
-        arguments, but where an argument is a range, every plant draws its own number.
+        Keyword arguments of `MiddlePointEnv`, except `render_mode`. All plants have the same
+        arguments. If an argument is a range, every plant draws its own value from the range.
 
     Attributes
     ----------
     autoreset_mode : AutoresetMode
-        When the plant of an ended episode is reset: see `MiddlePointVectorEnv`.
+        When to reset a plant whose episode has ended, as in `MiddlePointVectorEnv`.
     checks_actions : bool
-        Whether `step` refuses actions that are not finite; see the note on waiting.
+        Whether `step` raises a ValueError for actions that are not finite: True by default on a
+        CPU, and False on other devices.
 
     Raises
     ------
@@ -104,37 +105,42 @@ class MiddlePointTorchEnv(BatchEnv):
     -----
     **Random numbers.** All random numbers come from one `torch.Generator` on the device, which
     `reset(seed=seed)` restarts. The same seed, arguments and resets give the same numbers on
-    the same device, with the same versions of this package and of PyTorch. The random numbers
-    have the distributions of `MiddlePointVectorEnv`, but other values. Unlike there, the j-th
-    episode of a plant depends on the length of earlier episodes and on the other plants. So
-    compare controllers in `MiddlePointVectorEnv`, or on external signals.
+    the same device, with the same versions of this package and of PyTorch.
+    `MiddlePointTorchEnv` and `MiddlePointVectorEnv` draw different values from equal
+    distributions. In `MiddlePointTorchEnv`, the j-th episode of a plant depends on the lengths
+    of earlier episodes and on the other plants. To compare controllers on equal episodes, use
+    `MiddlePointVectorEnv` or external signals.
 
-    **External signals.** `reset(options={"signals": signals})` takes a dict of tensors. "noise"
-    (the noise n), "setpoint" (the set point y_d), "disturbance" (the load w) and
-    "measurement_noise", degC, have the shape (samples, num_envs), with sample k in row k. The
-    dict may also hold a number per plant, shape (num_envs,), for each argument that is a range,
-    under the argument's name. If a tensor has a further, leading dimension, the j-th episode of
-    a plant gets the j-th element; after the last element, the first element follows again.
-    Signals and ranges that are not in the dict are generated as usual. A step beyond the last
-    sample of a signal raises a ValueError.
+    **External signals.** `reset(options={"signals": signals})` replaces signals of the
+    environment by the tensors in the dict `signals`. The signals "noise" (the noise n),
+    "setpoint" (the set point y_d), "disturbance" (the load w) and "measurement_noise", in degC,
+    have the shape (samples, num_envs): row k holds sample k. The dict `signals` may contain
+    values of any argument that is a range, shape (num_envs,), under the name of the argument.
+    Every tensor may have a leading dimension of episodes: the j-th episode of a plant uses
+    element j, and after the last element, the first element again. The environment generates
+    all signals, and draws all values of ranges, that `signals` does not contain. `step` raises
+    a ValueError if the step leads beyond the last sample of an external signal.
 
-    **Gradients.** The gradient of rewards and observations with respect to actions goes
-    straight through the dead zone, as if there were no dead zone: so a policy also learns from
-    commands without effect, whose true gradient is 0. The gradient is 0 beyond the actuator's
-    limits and beyond the transmitter's span. `detach` cuts the gradient graph for truncated
-    backpropagation. An action affects the temperature after `delay` + 1 samples, so a segment
-    of fewer samples between two calls of `detach` has no gradient through the plant. Without
-    `differentiable`, the environment keeps no gradient graph. A copy or a pickle of the
-    environment, also in mid-episode, has no gradient graph of earlier actions.
+    **Gradients.** The gradient of rewards and observations with respect to actions ignores the
+    dead zone: a policy can learn from commands in the dead zone, although the true gradient of
+    these commands is 0. The applied flow has the gradient 0 beyond the actuator's limits, and
+    the measured temperature has the gradient 0 beyond the transmitter's span. `detach` cuts the
+    gradient graph for truncated backpropagation. An action affects the temperature after
+    `delay` + 1 samples, so fewer samples than that between two calls of `detach` give no
+    gradient through the plant. If `differentiable` is False, the environment keeps no gradient
+    graph. A copy or a pickle of the environment, even in the middle of an episode, has no
+    gradient graph of earlier actions.
 
-    **Waiting.** `step` never waits for the device. So `step` refuses actions that are not
-    finite only on the CPU; on other devices, a plant whose action is not finite may show NaN
-    until the plant is reset. `reset` may wait for the device.
+    **Waiting.** `step` never waits for the device to finish its computations. For this reason,
+    `step` raises a ValueError for actions that are not finite only on a CPU. On other devices,
+    a plant whose action is not finite may have the temperature NaN until the plant is reset.
+    `reset` may wait for the device.
 
-    **Memory.** The caller may keep or overwrite the tensors that a step returns, except the
-    masks and the drift factors in the infos, which several steps may share. Tensors of several
-    steps may share a block of memory, which is freed with the last of these tensors. The
-    observations, shape (num_envs, size), are contiguous by column, not by row.
+    **Memory.** The caller may keep or overwrite the tensors that `step` returns, except the
+    masks and the drift factors in the infos, which several steps may share. Tensors that
+    several steps return may share a block of memory, which is freed when no variable refers to
+    any of these tensors. In memory, the observations, shape (num_envs, size), are contiguous by
+    column, not by row.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as in VectorEnv)
@@ -175,7 +181,7 @@ class MiddlePointTorchEnv(BatchEnv):
         self._load = self._zeros  # the load w at the present sample, degC, shape (n,)
         self._own_signals = make_signals(self.parameters, self._episodes)
         self._signals = self._own_signals  # own or external signals, by name
-        self._external: dict[str, ExternalValues] = {}  # external signals and plant numbers
+        self._external: dict[str, ExternalValues] = {}  # external signals and parameter values
         # The last k for which all external signals have a value; None without such signals.
         self._last_sample: int | None = None
         # On a CPU, a block of samples must fit in the processor's cache. On other devices,
@@ -187,27 +193,27 @@ class MiddlePointTorchEnv(BatchEnv):
         levels = SetPointLevels(self.parameters)
         if levels.random:
             self._most_samples = min(self._most_samples, levels.shortest)
-        # The coming steps of the present block, the next step last.
+        # The results of the steps that remain in the present block, the next step last.
         self._ahead: list[_Step] = []
 
     __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> MiddlePointTorchEnv:
-        """Return a copy, also in mid-episode, without the gradient graph of earlier actions."""
+        """Return a copy of the environment, without the gradient graph of earlier actions."""
         duplicate: MiddlePointTorchEnv = pickle.loads(pickle.dumps(self))
         return duplicate
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of a pickle, which has lost the gradient graph of earlier actions."""
+        """Restore the state of a pickle, without the gradient graph of earlier actions."""
         vars(self).update(state)
         self.detach()
 
     def detach(self) -> None:
         """Cut the gradient graph to earlier actions, for truncated backpropagation.
 
-        The tensors that later steps return then depend only on actions after the call of
-        `detach`. The tensors that earlier steps have returned stay attached to the graph:
-        detach the latest observation, too, before the policy sees it.
+        The tensors that later steps return depend only on actions after the call of `detach`.
+        The tensors that earlier steps returned remain in the gradient graph, so detach the
+        latest observation as well before the policy uses that observation.
         """
         self._plants.detach()
         self._window.detach()
@@ -217,9 +223,9 @@ class MiddlePointTorchEnv(BatchEnv):
             self._ahead[k] = step._replace(rewards=step.rewards.detach(), infos=infos)
 
     def _advance(self, a: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
-        """Move all plants by one sample, and return what `step` returns if no episode ends.
+        """Advance all plants by one sample, and return what `step` returns if no episode ends.
 
-        `a` are the checked actions, shape (num_envs,).
+        `a` holds the actions that `_checked_actions` returned, shape (num_envs,).
         """
         command, applied = self._plants.apply(a)
         if not self._ahead:
@@ -234,10 +240,10 @@ class MiddlePointTorchEnv(BatchEnv):
         return observations, rewards, terminations, truncations, infos
 
     def _compute_block(self) -> None:
-        """Compute ahead what the steps of a block return, in `self._ahead` and `self._window`.
+        """Compute the results of the next steps, and store them in `_ahead` and `_window`.
 
-        An action affects the temperature only after the delay, so the temperatures of a block
-        follow from the actions so far.
+        An action affects the temperature only after the delay, so past actions determine the
+        temperatures of a block of successive samples.
         """
         samples_to_next_end = self._next_end - self._clock + 1
         samples = max(1, min(self._most_samples, samples_to_next_end))
@@ -255,8 +261,9 @@ class MiddlePointTorchEnv(BatchEnv):
         reading = reading.clamp(-span, span)
         self._window.extend(setpoint, setpoint - reading, reading)
 
-        # The infos of the block: for each name, a row of shape (n,) for each sample. What the
-        # environment still needs is copied, as the caller may overwrite the infos.
+        # The infos of the block: for each name, a row of shape (n,) for each sample. Set points
+        # and loads are copied, as the environment still needs both and the caller may overwrite
+        # the infos.
         if noise is None:
             noise = torch.zeros_like(error)
         infos_of_block: dict[str, Sequence[Any]] = {
@@ -286,7 +293,7 @@ class MiddlePointTorchEnv(BatchEnv):
             self._ahead.append(step)
 
     def _rewards(self, error: Tensor) -> Tensor:
-        """Return the rewards of errors, degC, of any shape, without the cost of moves."""
+        """Return the rewards for control errors, degC, without the term of `move_weight`."""
         scale = self.parameters.error_scale
         if self.parameters.reward == "quadratic":
             zero = error.new_zeros(())
@@ -295,15 +302,16 @@ class MiddlePointTorchEnv(BatchEnv):
         return error.abs().mul_(-1.0 / scale)
 
     def _begin(self, mask: Mask) -> dict[str, Tensor]:
-        """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
+        """Begin an episode of each plant in `mask`, and return infos at sample k = 0.
 
-        Infos that are always 0 at k = 0 are left out. The infos are tensors of shape
-        (num_envs,), in which elements of other plants have no meaning.
+        The returned dict lacks infos that are always 0 at k = 0, such as `output`. Every info
+        is a tensor of shape (num_envs,), whose elements for plants outside `mask` have no
+        meaning.
         """
         restart = Restart(self._as_array(mask), unused_rows=len(self._ahead))
         if mask.all():
-            # No plant needs past samples. Nor can every signal drop rows: a random signal that
-            # now takes the place of an external signal has not computed the latest block.
+            # No plant needs past samples. A random signal that replaces an external signal has
+            # not computed the latest block, and so has no rows of that block to drop.
             restart = restart._replace(unused_rows=0)
             self.detach()
         self._ahead = []
@@ -325,9 +333,9 @@ class MiddlePointTorchEnv(BatchEnv):
         return first_infos
 
     def _final_observations(self, ended: Mask, observations: Tensor) -> Tensor:
-        """Return the rows of observations of the plants in `ended`, and 0 for other plants.
+        """Return `observations`, with 0 in the rows of plants that are not in `ended`.
 
-        `observations`, and the result, have the shape (num_envs, size).
+        `observations` and the returned tensor have the shape (num_envs, size).
         """
         return torch.where(self._as_array(ended)[:, None], observations, 0)
 
@@ -336,15 +344,16 @@ class MiddlePointTorchEnv(BatchEnv):
         return copy_to_device(values, self.device)
 
     def _hidden_state(self) -> tuple[dict[str, Any], Tensor]:
-        """Return the drawn plant numbers by name, and the load w, degC, for `plant_state`."""
+        """Return the drawn parameter values by name, and the loads w, for `plant_state`."""
         numbers = {name: self._episodes.numbers[name] for name in self.parameters.ranges}
         return numbers, self._load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Check the seed and the options of a `reset` of the plants in `mask`, and apply both.
+        """Check the seed and the options of a `reset`, and apply both.
 
-        A ValueError is raised if the seed is no integer from 0 to 2^63 - 1, or if the options
-        hold signals that are not allowed.
+        `mask` is unused, as all plants share one random number generator. A ValueError is
+        raised if the seed is neither None nor an integer from 0 to 2^63 - 1, or if the option
+        `signals` is invalid.
         """
         if seed is not None and not (is_count(seed) and seed < 1 << 63):
             reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
@@ -352,12 +361,12 @@ class MiddlePointTorchEnv(BatchEnv):
             raise ValueError(
                 "options['signals'] needs a reset of all plants, without reset_mask"
             )
-        if "reset_mask" not in options:  # external signals last until the next such reset
+        if "reset_mask" not in options:  # a reset with a mask keeps external signals
             self._external = read_external(options.get("signals"), self.parameters, self._zeros)
             self._signals = {**self._own_signals}
             last_samples: list[int] = []
             for name, values in self._external.items():
-                if name in SIGNAL_NAMES:
+                if name in SIGNAL_NAMES:  # other names are arguments, which `Episodes` reads
                     self._signals[name] = values
                     last_samples.append(values.last_sample)
             self._last_sample = min(last_samples, default=None)
@@ -394,7 +403,7 @@ class MiddlePointTorchEnv(BatchEnv):
         return a
 
     def _check_signals_go_on(self, last_sample: int) -> None:
-        """Raise a ValueError if the next step of some plant leads beyond k = `last_sample`."""
+        """Raise a ValueError if the next step leads a plant beyond sample k = `last_sample`."""
         ages = self._clock - self._starts
         if self._ended is not None:  # the step resets these plants
             ages = ages[~self._ended]
@@ -406,7 +415,7 @@ class MiddlePointTorchEnv(BatchEnv):
 
 
 def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePointTorchEnv:
-    """Make many plants of an id or a spec in PyTorch, as `gymnasium.make_vec` does in NumPy.
+    """Make a PyTorch environment from an id or a spec, as `gymnasium.make_vec` does in NumPy.
 
     Parameters
     ----------
@@ -415,18 +424,18 @@ def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePoint
     num_envs
         Number of plants.
     **arguments
-        Arguments of `MiddlePointTorchEnv`, which replace the arguments of the id.
+        Keyword arguments of `MiddlePointTorchEnv`, which override the arguments of `env`.
 
     Returns
     -------
     MiddlePointTorchEnv
-        The plants. The `spec` of the environment describes one plant in NumPy, as
-        `mptc_gym.evaluate(policy, envs.spec)` needs.
+        Environment of `num_envs` plants. The attribute `spec` describes one plant in NumPy, for
+        calls such as `mptc_gym.evaluate(policy, envs.spec)`.
 
     Raises
     ------
     ValueError
-        If the id is unknown or of another environment, or an argument is out of range.
+        If `env` is unknown or is not a `MiddlePointEnv`, or if an argument is out of range.
     """
     single_arguments = {name: arguments[name] for name in ARGUMENTS if name in arguments}
     if "max_episode_steps" in arguments:

@@ -1,8 +1,8 @@
-"""Keep the episodes of many plants in PyTorch: times, plant numbers, external values.
+"""Keep start times, parameter values and external signals of many plants in PyTorch.
 
-Times are counted in steps of the environment, which computes blocks of samples ahead. If some
-plants are reset before `step` has returned all samples of a block, the unused samples at the
-end of the block are dropped, and computed anew for all plants.
+Times are counted in steps of the environment, which computes a block of successive samples in
+advance. If some plants are reset before `step` has returned all samples of a block, the unused
+samples at the end of the block are dropped, and computed again for all plants.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ Number = float | Tensor  # a float for all plants, or an element for each plant,
 def as_tensor(values: Any, like: Tensor) -> Tensor | None:
     """Return numbers as a tensor of the type and on the device of `like`.
 
-    The result is None if PyTorch cannot convert `values`.
+    None is returned if PyTorch cannot convert `values`.
     """
     try:
         return torch.as_tensor(values, dtype=like.dtype, device=like.device)
@@ -49,48 +49,50 @@ class Block(NamedTuple):
     due_rows: list[int]  # rows at which the load or the dynamics of some plant change
 
     def age(self, row: int) -> Tensor | int:
-        """Return the sample k of a row, shape (n,), or one number for all plants."""
+        """Return the sample number k at a row, shape (n,), or one number for all plants."""
         return self.first_time + row - self.starts
 
     def ages(self, device: torch.device) -> Tensor:
-        """Return the sample k of all rows, on the given device.
+        """Return the sample numbers k at all rows, as a tensor on `device`.
 
-        The shape is (samples, n), or (samples, 1) if all episodes began at one time.
+        The shape is (samples, n), or (samples, 1) if the episodes of all plants began at one
+        time.
         """
         return torch.arange(self.samples, device=device)[:, None] + self.age(0)
 
 
 class Restart(NamedTuple):
-    """The start of an episode of some plants, perhaps in the middle of a block."""
+    """Start of an episode of some plants, perhaps in the middle of a block of samples."""
 
     mask: Tensor  # True for the plants whose episode begins, shape (n,)
-    unused_rows: int  # rows at the end of the latest block that no `step` has returned
+    unused_rows: int  # number of rows of the latest block that no `step` has returned
 
 
 class History:
-    """The latest values of a quantity of n plants.
+    """Latest samples of one variable of n plants, such as the temperature.
 
     Attributes
     ----------
     rows : list of Tensor
-        The values, one tensor of shape (n,) for each sample, the oldest first: some samples
-        before the latest block, then the samples of the block.
+        Values, one tensor of shape (n,) for each sample, the oldest first: `length` samples
+        before the latest block of successive samples, then the samples of the block.
     """
 
     def __init__(self, zeros: Tensor, length: int) -> None:
-        """Begin with values of 0, shape (n,), and keep `length` samples before each block."""
+        """Begin with `length` samples, each equal to `zeros`, shape (n,)."""
         self.rows = [zeros] * length
         self._length = length
 
     def extend(self, block: Sequence[Tensor]) -> None:
-        """Add the values of a block, each of shape (n,), and forget values of older blocks."""
+        """Append the samples of `block`, and keep only `length` samples before `block`."""
         self.rows = [*self.rows[len(self.rows) - self._length :], *block]
 
     def reset(self, restart: Restart, newest: Tensor | None = None) -> None:
-        """Begin an episode of the plants in `restart.mask`, with values of 0.
+        """Set all values of the plants in `restart.mask` to 0, for a new episode.
 
-        Samples that no step has returned are forgotten for all plants. If `newest`, shape (n,),
-        is given, the values at k = 0 are not 0, but `newest`.
+        The last `restart.unused_rows` samples, which no `step` has returned, are dropped for
+        all plants. If `newest`, shape (n,), is given, the values of the plants in
+        `restart.mask` at sample k = 0 are `newest` instead of 0.
         """
         end = len(self.rows) - restart.unused_rows
         rows = self.rows[end - self._length : end]
@@ -99,30 +101,30 @@ class History:
             self.rows[-1] = torch.where(restart.mask, newest, self.rows[-1])
 
     def detach(self) -> None:
-        """Cut the gradient graph from the values to earlier actions."""
+        """Detach all values from PyTorch's gradient graph of earlier actions."""
         self.rows = [row.detach() for row in self.rows]
 
 
 class Episodes:
-    """The present episodes of n plants: when the episodes began, and the plant numbers.
+    """Present episodes of n plants, with the parameter values of each plant.
 
     Attributes
     ----------
     zeros : Tensor
-        Zeros of the device and type to use, shape (n,).
+        Zeros, shape (n,), with the device and the type of all tensors.
     generator : torch.Generator
-        The source of all random numbers.
+        Random number generator of the environment.
     numbers : dict
-        The plant numbers by name, floats or tensors of shape (n,).
+        Parameter values of the plants by name, as floats or as tensors of shape (n,).
     starts : Tensor or int
-        The time at which each plant's episode began, shape (n,), or one time for all plants, in
-        steps of the environment.
+        Start time of each plant's episode, in steps of the environment, shape (n,), or one
+        start time for all plants.
     """
 
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
-        """Prepare the plant numbers of n plants, before the first reset.
+        """Prepare the parameter values of n plants, before the first reset.
 
-        `zeros`, shape (n,), has the device and the type of all tensors.
+        `zeros` holds n zeros, with the device and the type of all tensors.
         """
         self.zeros = zeros
         self.generator = torch.Generator(zeros.device)
@@ -138,10 +140,10 @@ class Episodes:
         for name, lowest in vars(parameters.lowest).items():
             self.numbers[name] = zeros + lowest if name in tensor_names else float(lowest)
         self.starts: Tensor | int = 0
-        # Load and drifting dynamics change when the age of an episode is a multiple of
-        # `DRIFT_INTERVAL`: when the time, divided by `DRIFT_INTERVAL`, leaves the remainder of
-        # an episode's start. The remainders are on the host, so that nothing waits for the
-        # device.
+        # The load and the drifting dynamics of a plant change when the sample number k of the
+        # plant is a multiple of `DRIFT_INTERVAL`: when the time and the start time of the
+        # plant's episode leave equal remainders, divided by `DRIFT_INTERVAL`. The remainders
+        # are Python numbers, so that reading a remainder does not wait for the device.
         self._due_remainders: set[int] = set()
 
     def reset(
@@ -151,24 +153,25 @@ class Episodes:
         starts: NDArray[np.int64],
         external: Mapping[str, "ExternalValues"],
     ) -> dict[str, Tensor]:
-        """Begin an episode of some plants, and return the plant numbers that are ranges.
+        """Begin an episode of some plants, and return new values of arguments that are ranges.
 
         Parameters
         ----------
         restart
-            Which plants begin an episode.
+            Plants whose episode begins.
         time
-            The present time, in steps of the environment.
+            Present time: the number of steps of the environment so far.
         starts
-            The time at which each plant's episode began, shape (n,): `time` for plants whose
-            episode begins.
+            Start time of each plant's episode, in steps of the environment, shape (n,): for
+            plants whose episode begins, the start time is `time`.
         external
-            Plant numbers from outside, by name, in place of random numbers.
+            Parameter values that the user gives, by name, in place of random values.
 
         Returns
         -------
         dict of Tensor
-            The plant numbers by name, shape (n,). Elements of other plants have no meaning.
+            New values by the name of the argument, shape (n,). Elements of plants outside
+            `restart.mask` have no meaning.
         """
         numbers: dict[str, Tensor] = {}
         for name, (low, high) in self._ranges.items():
@@ -186,10 +189,7 @@ class Episodes:
         return numbers
 
     def block(self, first_time: int, samples: int) -> Block:
-        """Return the block of `samples` samples from the time `first_time` on.
-
-        The block also lists the rows at which the load or the dynamics of some plant change.
-        """
+        """Return a block of `samples` samples, whose row 0 is at the time `first_time`."""
         due_rows = [
             row
             for row in range(samples)
@@ -215,21 +215,22 @@ class Episodes:
 
 
 class ExternalValues:
-    """A signal, or a plant number, that is read from a tensor instead of being random.
+    """A signal, or a parameter of the plants, whose values the user gives in a tensor.
 
-    After its last episode, the tensor is read from its first episode on again. After the last
-    sample of an episode in the tensor, a signal keeps its last value.
+    After the last episode in the tensor, the next episode of a plant uses the first episode in
+    the tensor again. Beyond the last sample in the tensor, a signal keeps its last value.
 
     Attributes
     ----------
     last_sample : int
-        The last sample k of an episode for which the tensor has a value.
+        Sample number k of the last value that the tensor has for an episode.
     """
 
     def __init__(self, values: Tensor) -> None:
-        """Store values, degC, of a signal of n plants, shape (episodes, samples, n).
+        """Store the values of a signal of n plants, degC, shape (episodes, samples, n).
 
-        A plant number, such as a delay, is a signal of one sample in the number's own unit.
+        For a parameter of the plants, such as the delay, the number of samples is 1, and the
+        values have the unit of the parameter.
         """
         self._values = values
         # The index of each plant's present episode, shape (n,).
@@ -237,21 +238,22 @@ class ExternalValues:
         self.last_sample = values.shape[1] - 1
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin the next episode of the plants in `restart.mask`; return values at k = 0.
+        """Begin the next episode of plants in `restart.mask`, and return all values at k = 0.
 
-        The values have the shape (n,).
+        The tensor that is returned has the shape (n,).
         """
         self._episode = self._episode + restart.mask
         return self._at(torch.zeros_like(self._episode)[None])[0]
 
     def next(self, block: Block) -> Tensor:
-        """Return the values at the samples of a block, shape (samples, n)."""
+        """Return the values at the samples of `block`, shape (samples, n)."""
         return self._at(block.ages(self._values.device))
 
     def _at(self, ages: Tensor) -> Tensor:
-        """Return the values of the present episodes at given samples k, shape (samples, n).
+        """Return the values of the present episodes at the sample numbers `ages`.
 
-        `ages` are the samples k, of shape (samples, n), or (samples, 1) for all plants.
+        `ages` has the shape (samples, n), or (samples, 1) for all plants. The tensor that is
+        returned has the shape (samples, n).
         """
         episodes, samples, _ = self._values.shape
         # With episodes and samples as one axis, an episode begins every `samples` rows.
@@ -263,19 +265,12 @@ class ExternalValues:
 def read_external(
     signals: Any, parameters: Parameters, zeros: Tensor
 ) -> dict[str, ExternalValues]:
-    """Return the signals and plant numbers in `options["signals"]` of a reset, by name.
+    """Return the signals and parameter values in `options["signals"]` of a reset, by name.
 
     A ValueError is raised for an unknown name, and for values that have the wrong shape, are
-    not finite or out of range.
-
-    Parameters
-    ----------
-    signals
-        `options["signals"]`, as in `MiddlePointTorchEnv`; None if there is no such option.
-    parameters
-        The arguments of the environment.
-    zeros
-        Zeros of the device and type to use, shape (n,).
+    not finite or out of range. `signals` is `options["signals"]`, as in `MiddlePointTorchEnv`,
+    or None without that option. `zeros` holds n zeros, with the device and the type of all
+    tensors.
     """
     if signals is None:
         return {}
@@ -294,7 +289,7 @@ def read_external(
         if name in parameters.ranges:
             values = _finite_values(path, value, zeros, 1, f"({n},)")
             _check_range(path, values, parameters.ranges[name])
-            values = values[:, None]  # adds the axis of samples: a plant number has one sample
+            values = values[:, None]  # adds the axis of samples, of length 1
         else:
             values = _finite_values(path, value, zeros, 2, f"(samples, {n})")
         external[name] = ExternalValues(values)
@@ -304,20 +299,10 @@ def read_external(
 def _finite_values(path: str, value: Any, zeros: Tensor, dimensions: int, shape: str) -> Tensor:
     """Return numbers of the user as a tensor that has a leading dimension of episodes.
 
-    A ValueError is raised if `value` holds no finite numbers, or has a wrong shape.
-
-    Parameters
-    ----------
-    path
-        What an error message calls the numbers.
-    value
-        The numbers, with or without the dimension of episodes.
-    zeros
-        Zeros of the device and type to use, shape (n,).
-    dimensions
-        Number of dimensions without the dimension of episodes; the last has the size n.
-    shape
-        The shape of the numbers of one episode, for an error message.
+    In `value`, the dimension of episodes may be missing. The numbers of one episode have
+    `dimensions` dimensions, of which the last has the size n of `zeros`. A ValueError, which
+    calls the numbers `path` and their shape `shape`, is raised if a number is not finite, or if
+    `value` has a wrong shape.
     """
     values = as_tensor(value, zeros)
     if values is None:
@@ -328,8 +313,8 @@ def _finite_values(path: str, value: Any, zeros: Tensor, dimensions: int, shape:
     has_shape = values.ndim == dimensions + 1 and values.shape[-1] == len(zeros)
     if not has_shape or not values.numel():
         raise ValueError(
-            f"{path} must have the shape {shape}, or one more dimension before it, of "
-            f"episodes, got {shape_of_values}"
+            f"{path} must have the shape {shape}, or a leading dimension of episodes before "
+            f"this shape, got {shape_of_values}"
         )
     if not values.isfinite().all():
         raise ValueError(f"{path} must be finite")
@@ -337,10 +322,10 @@ def _finite_values(path: str, value: Any, zeros: Tensor, dimensions: int, shape:
 
 
 def _check_range(path: str, values: Tensor, ends: tuple[float, float]) -> None:
-    """Raise a ValueError if a plant number is outside the range from which it is drawn.
+    """Raise a ValueError if one of `values` is not in the range of an argument.
 
-    `path` is what the message calls the plant number. If the ends of the range are integers,
-    the plant number must be an integer.
+    `ends` are the ends of the range. If these ends are integers, all values must be integers.
+    The error message calls the values `path`.
     """
     low, high = values.new_tensor(ends)
     fits = (low <= values) & (values <= high)

@@ -1,9 +1,9 @@
-"""Move many plants in PyTorch, a block of samples at a time.
+"""Simulate many plants in PyTorch, a block of successive samples at a time.
 
 The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k), with
 temperature y, applied flow u_a, delay d and white noise xi. The actuator, with dead zone and
-limits, is equation (29). `mptc_gym.plant.dynamics.PlantBatch` moves many plants in NumPy, a
-sample at a time.
+limits, is equation (29) of the paper. `mptc_gym.plant.dynamics.PlantBatch` simulates many
+plants in NumPy, a sample at a time.
 """
 
 from collections import deque
@@ -19,21 +19,22 @@ from mptc_gym.torch_env.episodes import Block, Episodes, History, Number, Restar
 
 
 def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) -> Tensor:
-    """Return the flow u_a that the actuator applies, t/h, shape (n,), for a command u.
+    """Return the flow u_a that the actuator applies for a command u, t/h, shape (n,).
 
-    The actuator is equation (29) of the paper: no flow for a command in the dead zone,
-    otherwise the command within the limits. The gradient of the flow is 1 within the limits,
-    also in the dead zone, and 0 beyond the limits.
+    The actuator is equation (29) of the paper: the applied flow is 0 for a command in the dead
+    zone, and otherwise the command, clipped to the limits. The gradient of the applied flow
+    with respect to the command is 1 within the limits, even in the dead zone, and 0 beyond the
+    limits.
 
     Parameters
     ----------
     command
         Commanded flows u, t/h, shape (n,).
     edge
-        Magnitude above which a command passes the dead zone, t/h; see
-        `least_effective_command`.
+        Edge of the dead zone, t/h, from `least_effective_command`: a command with a larger
+        magnitude has an effect.
     u_min, u_max
-        Limits, t/h: two floats, or two tensors of shape (n,).
+        Limits of the actuator, t/h: two floats, or two tensors of shape (n,).
     """
     are_floats = (
         isinstance(edge, float) and isinstance(u_min, float) and isinstance(u_max, float)
@@ -54,17 +55,18 @@ def applied_flow(command: Tensor, edge: Number, u_min: Number, u_max: Number) ->
 
 
 class TorchPlants:
-    """n plants with their actuators in PyTorch, with gradients if the actions have any.
+    """n plants and their actuators in PyTorch, with gradients if the actions have gradients.
 
     Attributes
     ----------
     most_samples : int
-        The most samples in a block: d + 1, with d the shortest delay that can be drawn. The
-        temperatures of the d + 1 samples after an action do not depend on later actions.
+        Maximum number of samples in a block: d + 1, where d is the shortest delay that can be
+        drawn. The temperatures of the d + 1 samples after an action do not depend on later
+        actions.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
-        """Prepare the plants; `episodes` holds delays, dead zones and other plant numbers."""
+        """Prepare the plants, whose delays, dead zones and other values are in `episodes`."""
         self._episodes = episodes
         self._zeros = episodes.zeros
         self._dynamics = Dynamics(parameters)
@@ -81,14 +83,13 @@ class TorchPlants:
         self._outputs = History(self._zeros, len(parameters.a) - 1)
 
     def reset(self, restart: Restart, age: Tensor | int) -> None:
-        """Bring the plants in `restart.mask` to rest, with the plant numbers of a new episode.
+        """Bring the plants in `restart.mask` to rest, with parameter values of a new episode.
 
-        Plant numbers are delay, dead zone, limits, gain and so on. `age` is the sample k of
-        each plant, shape (n,), or one number for all plants.
+        `age` is the sample number k of each plant, shape (n,), or one number for all plants.
         """
         self._outputs.reset(restart)
         flows = torch.stack([*self._flows]).masked_fill_(restart.mask, 0.0)
-        self._flows.extend(flows.unbind())  # the deque drops as many old flows
+        self._flows.extend(flows.unbind())  # the deque drops its old flows
         self._reset_actuator()
         self._reset_delays()
         numbers = PlantNumbers(**self._episodes.numbers)
@@ -104,19 +105,19 @@ class TorchPlants:
         self._update_dynamics(age)
 
     def _reset_actuator(self) -> None:
-        """Compute what `apply` needs of the limits and dead zones of the present episodes."""
+        """Compute the limits and dead zones of the actuators, for `apply`."""
         numbers = self._episodes.numbers
         u_min = numbers["u_min"]
         u_max = numbers["u_max"]
         self._limits = u_min, u_max
         self._middle = self._zeros.new_zeros(()) + (u_min + u_max) / 2.0
         self._half_range = (u_max - u_min) / 2.0
-        # Eight roundings, each of half an eps: see `least_effective_command`.
+        # Bound of the relative error of eight roundings, each of at most half an eps.
         rounding = 4.0 * torch.finfo(self._zeros.dtype).eps
         self._edge = least_effective_command(numbers["dead_zone"], u_min, u_max, rounding)
 
     def _reset_delays(self) -> None:
-        """Compute the indices at which `_response` finds the delayed flows of each plant.
+        """Compute the indices at which `_response` reads the delayed flows of each plant.
 
         The indices, shape (rows, n), refer to the flows of all plants in one flat tensor.
         Without random delays, `_response` needs no indices.
@@ -131,11 +132,11 @@ class TorchPlants:
             self._delayed_at = (rows[:, None] + first_rows) * n + columns
 
     def _update_dynamics(self, age: Tensor | int) -> None:
-        """Compute the factors of past temperatures, past flows and load at sample k = `age`.
+        """Compute the coefficients of equation (28) of the paper at sample k = `age`.
 
-        The factors are the coefficients of equation (28) of the paper. If gain and time
-        constant drift, the factors change at multiples of `DRIFT_INTERVAL`. `age` has the shape
-        (n,), or is one number for all plants.
+        The coefficients are factors of past temperatures, past flows and load. If gain and time
+        constant drift, the coefficients change at sample numbers that are multiples of
+        `DRIFT_INTERVAL`. `age` has the shape (n,), or is one number for all plants.
         """
         if self._drifts:
             if isinstance(age, Tensor):
@@ -153,45 +154,47 @@ class TorchPlants:
     def apply(self, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Apply the actions a(k) of all plants, shape (n,), and store the applied flows.
 
-        The results are the commanded flows u(k) and the applied flows u_a(k), t/h, shape (n,).
+        `apply` returns the commanded flows u(k) and the applied flows u_a(k), t/h, shape (n,).
         """
         u_min, u_max = self._limits
         # Actions from -1 to 1 command flows from u_min to u_max (last formula of the paper's
-        # Section 4). In float64, rounding is that of NumPy; in float32, speed counts more.
+        # Section 4). In float64, the formula rounds as NumPy does; in float32, a faster formula
+        # is used.
         if actions.dtype == torch.float64:
             command = actions.add(1.0).mul_(self._half_range).add_(u_min)
         else:
             command = _add_product(self._middle, self._half_range, actions)
         applied = applied_flow(command, self._edge, u_min, u_max)
-        self._flows.append(applied.clone())  # as the caller may overwrite what is returned
+        self._flows.append(applied.clone())  # a copy, as the caller may overwrite `applied`
         return command, applied
 
     def outputs(
         self, block: Block, noise: Tensor | None, load: Tensor | None
     ) -> tuple[Tensor, list[tuple[Number, ...]]]:
-        """Compute the temperatures of a block, after the action before the block was applied.
+        """Return the temperatures and drift factors of a block of successive samples.
 
         Parameters
         ----------
         block
-            The samples to compute, at most `most_samples`.
+            Block of at most `most_samples` samples, which follow the last action that `apply`
+            has applied.
         noise, load
-            Coloured noise n and load w of the block, degC, shape (samples, n); None for a
-            signal that is always 0.
+            Coloured noise n and load w, degC, shape (samples, n). None means that the signal is
+            always 0.
 
         Returns
         -------
         Tensor
             Temperatures y, degC, shape (samples, n).
         list of tuple
-            At each sample, the gain factor and the time constant factor, as multiples of gain
-            and time constant of the polynomials A and B.
+            Gain factor and time constant factor at each sample, relative to the gain and the
+            time constant of the polynomials A and B.
         """
         outputs = [*self._outputs.rows]
         factors: list[tuple[Number, ...]] = []
         response = self._response(block.samples)
         rows_of_change = block.due_rows if self._drifts else []
-        # Between two of these rows of the block, the coefficients are constant.
+        # Between two boundaries, the coefficients are constant.
         boundaries = sorted({0, *rows_of_change, block.samples})
         for first, end in pairwise(boundaries):
             if first in rows_of_change:
@@ -215,15 +218,16 @@ class TorchPlants:
         return torch.stack(new_outputs), factors
 
     def detach(self) -> None:
-        """Cut the gradient graph from past flows and temperatures to earlier actions."""
+        """Detach past flows and temperatures from the gradient graph of earlier actions."""
         self._outputs.detach()
         self._flows.extend([flow.detach() for flow in self._flows])
 
     def _response(self, samples: int) -> Tensor:
-        """Return the part of the temperatures that past flows cause, degC, shape (samples, n).
+        """Return the effect of past flows on the temperatures, degC, shape (samples, n).
 
-        The part at sample k is B(z^-1) u_a(k-d), with the polynomial B of equation (28) of the
-        paper, applied flow u_a and delay d. `samples` is the number of samples in the block.
+        The effect at sample k is B(z^-1) u_a(k-d), with the polynomial B of equation (28) of
+        the paper, applied flow u_a and delay d. `samples` is the number of samples in the
+        block.
         """
         # One delayed flow for each sample, and before them the flows for further terms of B.
         rows = samples + len(self._beta) - 1

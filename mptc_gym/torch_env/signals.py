@@ -1,8 +1,9 @@
-"""Generate the external signals of many plants in PyTorch, from one random number generator.
+"""Generate set points, noise and loads of many plants in PyTorch, without loops over plants.
 
-A signal class has two methods, which work on n plants at once, without a loop over plants.
-`next(block)` returns the samples of the next block, degC, shape (samples, n). `reset(restart)`
-begins an episode of some plants, and returns the signal at sample k = 0, degC, shape (n,).
+All random numbers come from one random number generator. Every signal class has two methods,
+`next` and `reset`. `next(block)` returns the samples of the next block, degC, shape (samples,
+n). `reset(restart)` begins an episode of some plants, and returns the signal at sample k = 0,
+degC, shape (n,).
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from mptc_gym.torch_env.episodes import Block, Episodes, ExternalValues, History
 
 
 class Noise:
-    """The plant's noise or the transmitter's noise, for many plants; 0 at k = 0."""
+    """Noise of many plants or of their transmitters, degC, which is 0 at sample k = 0."""
 
     def __init__(self, name: str, c: Sequence[float], episodes: Episodes) -> None:
         """Prepare the coloured noise C(z^-1) xi(k), degC, with white noise xi.
@@ -24,12 +25,13 @@ class Noise:
         Parameters
         ----------
         name
-            "noise" for the noise n of equation (28) of the paper, or "measurement_noise" for
-            the noise of the transmitter.
+            Name of the noise: "noise" for the noise n of equation (28) of the paper, or
+            "measurement_noise" for the noise of the transmitter.
         c
-            The coefficients of the polynomial C, from z^0 on.
+            Coefficients of the polynomial C(z^-1), beginning with the constant term.
         episodes
-            The present episodes, which hold the variance and the random number generator.
+            Episodes of the plants, with the variance of the noise and the random number
+            generator.
         """
         self._variance_name = f"{name}_variance"
         self._c = c
@@ -40,14 +42,14 @@ class Noise:
         self._xi = episodes.zeros.expand(self._order, -1)
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin an episode of the plants in `restart.mask`; return zeros, shape (n,)."""
+        """Begin an episode of the plants in `restart.mask`, and return zeros, shape (n,)."""
         self._deviation = self._episodes.numbers[self._variance_name] ** 0.5
         used_rows = self._xi[: len(self._xi) - restart.unused_rows]
         self._xi = used_rows.masked_fill(restart.mask, 0.0)
         return self._episodes.zeros
 
     def next(self, block: Block) -> Tensor:
-        """Return the noise of the samples of a block, degC, shape (samples, n)."""
+        """Return the noise at the samples of `block`, degC, shape (samples, n)."""
         order = self._order
         generator = self._episodes.generator
         past = self._xi[len(self._xi) - order :]
@@ -65,14 +67,15 @@ class Noise:
 
 
 class RandomSetPoint:
-    """A set point of random levels, each level held for a random number of samples.
+    """Set point that takes random levels, each level for a random number of samples.
 
-    The present and the next level of each plant are enough for a block of samples, as no block
-    is longer than the shortest level. Times are counted in samples of the signal.
+    No block of samples is longer than the shortest level, so a block needs only the present
+    level and the next level of each plant. Times are counted in samples that `next` has
+    generated.
     """
 
     def __init__(self, levels: SetPointLevels, episodes: Episodes) -> None:
-        """Draw from the ranges of levels and lengths in `levels`, from the first reset on."""
+        """Prepare to draw levels and their lengths from the distribution in `levels`."""
         self._distribution = levels
         self._episodes = episodes
         zeros = episodes.zeros
@@ -110,7 +113,7 @@ class RandomSetPoint:
         return torch.where(times[:, None] >= self._level_end, self._next_level, self._level)
 
     def _draw(self) -> tuple[Tensor, Tensor]:
-        """Draw a level, degC, and its length, samples, for each plant: two of shape (n,)."""
+        """Return a random level, degC, and its length, samples, for each plant: shape (n,)."""
         distribution = self._distribution
         levels = self._episodes.draw_within_one(1)[0] * distribution.amplitude
         lengths = self._episodes.draw(
@@ -126,10 +129,10 @@ class RandomSetPoint:
 
 
 class RepeatedSetPoint:
-    """A set point that repeats a sequence of levels, which all plants share."""
+    """Set point that repeats one sequence of levels for all plants."""
 
     def __init__(self, levels: SetPointLevels, episodes: Episodes) -> None:
-        """Take the levels, degC, and their lengths, samples, from `levels`."""
+        """Store the levels, degC, and the lengths of the levels, samples, from `levels`."""
         self._n = len(episodes.zeros)
         self._levels = episodes.zeros.new_tensor(levels.values)
         # The samples of a period at which the levels end.
@@ -149,26 +152,26 @@ class RepeatedSetPoint:
 
 
 class Disturbance:
-    """The load disturbance w(k), degC, of many plants: the sum of steps and a random walk.
+    """Load disturbance w(k) of many plants, degC: the sum of random steps and a random walk.
 
-    `mptc_gym.plant.signals.Disturbance` describes the distribution of steps and walk.
+    `mptc_gym.plant.signals.Disturbance` documents the distributions of the steps and the walk.
     """
 
     def __init__(self, episodes: Episodes) -> None:
-        """Begin with a load of 0; `episodes` holds plant numbers and generator."""
+        """Begin with a load of 0, and draw random numbers from the generator in `episodes`."""
         self._episodes = episodes
         # The two parts of the load, steps and walk, degC.
-        self._steps = History(episodes.zeros, 1)
-        self._walk = History(episodes.zeros, 1)
+        self._steps = History(episodes.zeros, length=1)
+        self._walk = History(episodes.zeros, length=1)
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin an episode, with a load of 0, of the plants in `restart.mask`; return zeros."""
+        """Begin an episode of the plants in `restart.mask`, and return zeros, shape (n,)."""
         self._steps.reset(restart)
         self._walk.reset(restart)
         return self._episodes.zeros
 
     def next(self, block: Block) -> Tensor:
-        """Return the load at the samples of a block, degC, shape (samples, n)."""
+        """Return the load at the samples of `block`, degC, shape (samples, n)."""
         step = self._steps.rows[-1]
         walk = self._walk.rows[-1]
         steps: list[Tensor] = []
@@ -183,15 +186,11 @@ class Disturbance:
         return torch.stack(steps).add_(torch.stack(walks))
 
     def _change(self, step: Tensor, walk: Tensor, age: Tensor | int) -> tuple[Tensor, Tensor]:
-        """Return the next values of the two parts of the load, degC, each of shape (n,).
+        """Return the next values of steps and random walk, degC, each of shape (n,).
 
-        Parameters
-        ----------
-        step, walk
-            The present values of the sum of steps and of the random walk, degC, shape (n,).
-        age
-            The sample k of each plant, shape (n,), or one number for all plants. The load of a
-            plant changes only if k is a multiple of `LOAD_INTERVAL`.
+        `step` and `walk` are the present values, degC, shape (n,). `age` is the sample number k
+        of each plant, shape (n,), or one number for all plants. The load of a plant changes
+        only if k is a multiple of `LOAD_INTERVAL`.
         """
         numbers = self._episodes.numbers
         step_draws, walk_draws = self._episodes.draw_within_one(2)
@@ -220,7 +219,7 @@ Signal = Noise | RandomSetPoint | RepeatedSetPoint | Disturbance | ExternalValue
 
 
 def make_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
-    """Return the signals of an environment by name, without those that are always 0."""
+    """Return the signals of an environment by name, except signals that are always 0."""
     levels = SetPointLevels(parameters)
     signals: dict[str, Signal] = {}
     if levels.random:

@@ -9,7 +9,7 @@ from mptc_gym.torch_env.episodes import History, Restart
 
 
 class Window:
-    """The observations of n plants, computed ahead for a block of samples."""
+    """Observations of n plants, computed in advance for a block of successive samples."""
 
     def __init__(self, windows: Sequence[int], zeros: Tensor) -> None:
         """Prepare observations of n plants.
@@ -17,9 +17,9 @@ class Window:
         Parameters
         ----------
         windows
-            How many set points, errors, outputs and past actions an observation holds.
+            Numbers of set points, errors, outputs and past actions in an observation.
         zeros
-            Zeros of the device and type to use, shape (n,).
+            Zeros, shape (n,), with the device and the type of all tensors.
         """
         *self._windows, self._past_actions = windows
         self._zeros = zeros
@@ -31,10 +31,10 @@ class Window:
         self._ahead: list[Tensor] = []
 
     def reset(self, restart: Restart, setpoint: Tensor, rest_action: Tensor) -> None:
-        """Set the observations of the plants in `restart.mask` to those of a plant at rest.
+        """Fill the observations of plants in `restart.mask` with the values of a plant at rest.
 
-        `setpoint` are set points y_d(0), degC, and `rest_action` the actions for a flow of 0
-        t/h, both of shape (n,).
+        `setpoint` holds the set points y_d(0), degC, and `rest_action` the actions that command
+        a flow of 0 t/h, both of shape (n,).
         """
         setpoints, errors, outputs = self._histories
         setpoints.reset(restart, newest=setpoint)
@@ -43,7 +43,7 @@ class Window:
         self._actions = torch.where(restart.mask, rest_action.clamp(-1.0, 1.0), self._actions)
 
     def extend(self, *blocks: Tensor) -> None:
-        """Add a block of set points, errors and outputs, in this order.
+        """Add successive samples of set points, errors and outputs, in the order named here.
 
         Each tensor in `blocks` has the shape (samples, n), degC.
         """
@@ -54,9 +54,9 @@ class Window:
         self._ahead = self._stack(samples, first_place=1)[::-1]
 
     def next(self, actions: Tensor) -> Tensor:
-        """Return the observations of the next sample of the block, shape (n, size).
+        """Return the observations at the next sample of the block, shape (n, size).
 
-        `actions`, shape (n,), are the actions that led to this sample.
+        `actions`, shape (n,), are the actions of the step that leads to the next sample.
         """
         observations = self._ahead.pop()
         if self._past_actions:
@@ -70,17 +70,16 @@ class Window:
         return torch.cat((*self._stack(1, first_place=0), self._actions)).t()
 
     def detach(self) -> None:
-        """Cut the gradient graph from stored observations to earlier actions."""
+        """Detach stored observations from PyTorch's gradient graph of earlier actions."""
         for history in self._histories:
             history.detach()
         self._ahead = [observations.detach() for observations in self._ahead]
         self._actions = self._actions.detach()
 
     def _stack(self, samples: int, first_place: int) -> list[Tensor]:
-        """Return the observations of consecutive samples, in tensors of shape (size, n).
+        """Return observations at successive samples, without actions, each of shape (size, n).
 
-        Past actions are left out. The first of the `samples` observations begins at index
-        `first_place` of the histories.
+        The first of the `samples` observations begins at index `first_place` of the histories.
         """
         newest_first: list[Tensor] = []  # the elements of all observations, shape (n,) each
         for place in range(first_place, first_place + samples):

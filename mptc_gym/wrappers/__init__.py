@@ -24,46 +24,49 @@ ACTUATOR_NUMBERS = "dead_zone", "u_min", "u_max"
 
 
 class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructorArgs):
-    """The action changes the flow instead of setting it: the velocity form of process control.
+    """Wrapper whose action changes the feedwater flow instead of setting the flow.
 
-    The wrapper keeps a wanted flow v, in t/h, which is 0 after `reset`. An action w, from -1 to
-    1, moves the wanted flow::
+    In process control, changing the flow at each step is called the velocity form. The wrapper
+    stores a wanted flow v, t/h, which is the flow that the policy asks for, and 0 after
+    `reset`. An action w, from -1 to 1, changes v, the flow in t/h that the policy asks for::
 
         v(k) = v(k-1) + w(k) max_move (u_max - u_min) / 2,   limited to [u_min, u_max]
 
-    where u_min and u_max are the limits of the actuator. The commanded flow is u(k) = v(k). The
-    velocity form spares the valve, and makes exploration effective, as each change of the flow
-    lasts.
+    The actuator's limits are u_min and u_max, t/h. Without compensation of the dead zone, the
+    commanded flow is u(k) = v(k), the flow that the policy asks for. Changing the flow, instead
+    of setting the flow, wears the valve less and makes exploration effective, because every
+    change of the flow lasts.
 
-    With `compensate_dead_zone`, the commanded flow u skips the dead zone, of half width z,
-    t/h::
+    With `compensate_dead_zone`, the commanded flow u skips the dead zone, whose half width is
+    z, t/h::
 
         v > 0:   u =  z + (u_max - z) v / u_max
         v = 0:   u =  0
         v < 0:   u = -z + (u_min + z) v / u_min
 
-    With compensation, every change of the wanted flow v has an effect, and v reaches every flow
-    that the actuator can apply. The commanded flow stays 0 from `reset` until the first nonzero
-    action.
+    With compensation of the dead zone, every change of the wanted flow v changes the applied
+    flow, and some v leads to every flow that the actuator can apply. The commanded flow is 0
+    from `reset` until the first nonzero action.
 
-    The action space is `Box(-1, 1, (1,), float32)`; actions beyond +-1 are clipped.
-    Observation, reward (with `move_weight`) and info are those of the wrapped environment,
-    which receives absolute actions: actions that set the flow. A policy must know the wanted
-    flow v, which follows from the newest past action in the observation: so set `action_window`
-    to at least 1. With the default delay of 18 samples, `action_window=20` makes the problem
-    without noise a Markov decision process as long as the set point stays constant.
+    The action space is `Box(-1, 1, (1,), float32)`; actions beyond +-1 are clipped. The wrapped
+    environment receives an action that sets the flow, and computes observation, reward (with
+    `move_weight`) and info from that action. A policy must know the wanted flow v, which
+    follows from the newest past action in the observation, so the environment needs an
+    `action_window` of at least 1. With the default delay of 18 samples, without noise and with
+    a constant set point, `action_window=20` makes the control problem a Markov decision
+    process.
 
     Parameters
     ----------
     env
         A `MiddlePointEnv`, wrapped or not.
     max_move
-        Change of the wanted flow by an action of 1, as a share of (u_max - u_min) / 2: a number
-        above 0, up to 2.
+        Change of the wanted flow that an action of 1 causes, as a share of (u_max - u_min) / 2:
+        a number above 0, up to 2.
     compensate_dead_zone
-        False leaves the dead zone as it is. True compensates the dead zone of the plant, or of
-        the present episode if `dead_zone` is a range. A number is the half width, t/h, of the
-        dead zone to compensate.
+        Whether commands skip the dead zone. True compensates the dead zone of the plant, or of
+        the present episode if `dead_zone` is a range. False compensates no dead zone. A number
+        is the half width, t/h, of the dead zone to compensate.
 
     Attributes
     ----------
@@ -73,8 +76,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     Raises
     ------
     ValueError
-        If an argument is out of range. `step` raises a ValueError if the action is not one
-        finite number, and leaves the wrapper and the environment unchanged.
+        If an argument is invalid. `step` raises a ValueError if the action is not one finite
+        number, and leaves the wrapper and the environment unchanged.
 
     Examples
     --------
@@ -102,7 +105,7 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         gymnasium.ActionWrapper.__init__(self, env)
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.increments = max_move, compensate_dead_zone
-        # Dead zone and limits, t/h; the lowest value of those that a reset draws anew.
+        # Dead zone and limits, t/h; for a range, from which `reset` draws, the lowest value.
         self._numbers = {name: parameters.range_of(name)[0] for name in ACTUATOR_NUMBERS}
         self._actuator = Actuator(self._numbers, max_move, compensate_dead_zone)
         self._flow = 0.0  # wanted flow v, t/h
@@ -112,7 +115,8 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, and set the wanted flow to 0 t/h.
 
-        `seed`, `options`, observation and info are those of the wrapped environment.
+        `seed` and `options` go to the wrapped environment, whose observation and info are
+        returned.
         """
         observation, info = self.env.reset(seed=seed, options=options)
         drawn_numbers = {name: info[name] for name in ACTUATOR_NUMBERS if name in info}
@@ -124,10 +128,10 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         return f"<{type(self).__name__}{self.increments}{self.env}>"
 
     def action(self, action: Any) -> NDArray[np.float32]:
-        """Move the wanted flow by an action, and return the action that sets the new flow.
+        """Change the wanted flow by an action, and return the action that sets the new flow.
 
-        `action` is one number, shape (1,). The result, shape (1,), is the action of the wrapped
-        environment. A ValueError is raised if `action` is not one finite number.
+        `action`, and the returned action of the wrapped environment, have the shape (1,). A
+        ValueError is raised if `action` is not one finite number.
         """
         move = max(-1.0, min(1.0, one_action(action)))
         actuator = self._actuator
@@ -137,13 +141,13 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 
 
 class Actuator:
-    """Dead zone and limits of one or n actuators, and the actions that command a wanted flow.
+    """Dead zone and limits of one or n actuators, to convert a wanted flow to an action.
 
     Parameters
     ----------
     numbers
-        `dead_zone`, `u_min` and `u_max`, t/h, by name: floats for one plant, or arrays of shape
-        (n,) for n plants.
+        Values of `dead_zone`, `u_min` and `u_max`, t/h, by name: floats for one plant, or
+        arrays of shape (n,) for n plants.
     max_move, compensate_dead_zone
         The arguments of `IncrementalAction`.
 
@@ -152,7 +156,7 @@ class Actuator:
     u_min, u_max : float or array
         The limits of the actuator, t/h.
     flow_per_action : float or array
-        Change of the wanted flow by an action of 1, t/h.
+        Change of the wanted flow that an action of 1 causes, t/h.
 
     Raises
     ------
@@ -174,23 +178,26 @@ class Actuator:
         self._compensates = zone is not False
         # Half width of the dead zone that the commands skip, t/h; unused without compensation.
         self._zone: Any = numbers["dead_zone"] if zone is True else zone
+        # The slopes du/dv of the commanded flow u over the wanted flow v, for v > 0 and v < 0.
         self._slope_above = self._slope(self.u_max)
         self._slope_below = self._slope(-self.u_min)
 
     def _slope(self, limit: Any) -> Any:
-        """Return the change of the commanded flow per change of the wanted flow, as a ratio.
+        """Return du/dv, the slope of the commanded flow u over the wanted flow v.
 
-        `limit` is the magnitude of the limit towards which the flow moves, t/h. For a limit
-        inside the dead zone, the ratio is 0: every command is then at the edge of the dead
-        zone, beyond the limit, and the actuator applies the limit itself.
+        `limit` is the magnitude of the actuator's limit, t/h: u_max for flows above 0, and
+        -u_min for flows below 0. For a limit inside the dead zone, the slope is 0: every
+        command is at the edge of the dead zone, beyond the limit, and the actuator applies the
+        limit itself.
         """
         return np.maximum(limit - self._zone, 0.0) / np.where(limit > 0.0, limit, 1.0)
 
     def action(self, flow: Any) -> Any:
-        """Return the action of the wrapped environment for a wanted flow, t/h.
+        """Return the action of the wrapped environment that commands a wanted flow, t/h.
 
-        `flow` is a float or an array, and so is the result. With compensation, the action
-        commands a flow outside the dead zone unless the wanted flow is 0.
+        `flow` and the returned action are floats, or arrays of shape (n,). With compensation of
+        the dead zone, the action commands a flow outside the dead zone unless the wanted flow
+        is 0.
         """
         if not self._compensates:
             return action_from_command(flow, self.u_min, self.u_max)

@@ -17,11 +17,11 @@ from mptc_gym.wrappers import ACTUATOR_NUMBERS, Actuator
 
 
 class IncrementalAction(VectorActionWrapper):
-    """The action changes the flow: `mptc_gym.wrappers.IncrementalAction` for many plants.
+    """Wrapper whose actions change the feedwater flows of many plants instead of setting them.
 
-    `reset` and `step` return the same as `mptc_gym.wrappers.IncrementalAction` around each
-    single environment. The wrapper supports all three autoreset modes, and resets of only some
-    plants.
+    `reset` and `step` return the same values as an `mptc_gym.wrappers.IncrementalAction` around
+    each single environment. The wrapper supports all three autoreset modes of Gymnasium, and
+    resets of only some plants.
 
     Parameters
     ----------
@@ -56,8 +56,8 @@ class IncrementalAction(VectorActionWrapper):
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.increments = max_move, compensate_dead_zone
-        # Dead zones and limits of all plants, t/h, shape (num_envs,) each; the lowest value of
-        # those that a reset draws anew.
+        # Dead zones and limits of all plants, t/h, each of shape (num_envs,); for a range, from
+        # which `reset` draws, the lowest value.
         self._numbers = {}
         plants_per_group = [group.num_envs for group in groups]
         for name in ACTUATOR_NUMBERS:
@@ -70,9 +70,10 @@ class IncrementalAction(VectorActionWrapper):
         self._ended = np.zeros(self.num_envs, np.bool_)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        """Reset all environments, or those in `reset_mask`, and their wanted flows to 0 t/h.
+        """Reset all plants, or the plants in `reset_mask`, and set their wanted flows to 0 t/h.
 
-        `seed`, `options`, observations and infos are those of the wrapped environment.
+        `seed` and `options` go to the wrapped environment, whose observations and infos are
+        returned.
         """
         # The mask is read before the reset, in which Gymnasium's vector environments remove the
         # mask from the options.
@@ -84,9 +85,9 @@ class IncrementalAction(VectorActionWrapper):
         return observations, infos
 
     def step(self, actions: Any) -> Any:
-        """Move the wanted flows by actions, shape (num_envs, 1), and step the environments.
+        """Change the wanted flows by actions, shape (num_envs, 1), and step the environments.
 
-        The result is what `step` of the wrapped vector environment returns.
+        The returned values are those of `step` of the wrapped vector environment.
         """
         moves = many_actions(actions, self.num_envs, self._ended)
         actuator = self._actuator
@@ -107,8 +108,7 @@ class IncrementalAction(VectorActionWrapper):
     def _begin_episodes(self, mask: NDArray[np.bool_], infos: dict[str, Any]) -> None:
         """Set the wanted flows of the plants in `mask`, shape (num_envs,), to 0 t/h.
 
-        If dead zones or limits are random, their new values are taken from the infos of the
-        reset.
+        The infos of the reset hold the new values of dead zones and limits that are random.
         """
         for name in {*ACTUATOR_NUMBERS} & {*infos}:
             self._numbers[name][mask] = infos[name][mask]
