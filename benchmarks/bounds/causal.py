@@ -147,9 +147,9 @@ class SetPointLaw:
         """Return the mean slopes dE|e|/dE[e] at `ages` of a level of the set point.
 
         The means are conditional on no change of the set point up to the age `known_age`, in
-        samples. All elements of `ages` are larger than `known_age`. `slope_if_held` has the
-        slope at each age of a level that never changes. `change_sums` is the result of
-        `_sums_after_next_change` for the level.
+        samples, which is lower than all elements of `ages`. `slope_if_held` has the slope at
+        each age of a level that never changes. `change_sums` has the cumulative sums that
+        `_sums_after_next_change` returns for the level of the set point.
         """
         # The set point changes to the next level at an age of the present level from `first` to
         # `longest`; all these ages are equally probable.
@@ -209,9 +209,10 @@ class SetPointLaw:
 
         The slope at an age solves an equation: an additional flow whose first effect is at this
         age does not change the sum of the mean errors, so the sum of the impulse response times
-        the mean slopes is 0. The equation of the highest age is solved first, since the
-        equation of an age contains the slopes of all higher ages. `change_sums` is the result
-        of `_sums_after_next_change` for the level.
+        the mean slopes is 0. The equations are solved from the highest age to the lowest age,
+        since the slope at an age depends on the slopes at all higher ages. `change_sums` has
+        the cumulative sums that `_sums_after_next_change` returns for the level of the set
+        point.
         """
         samples = len(self._probability_held)
         slope = np.zeros(samples)

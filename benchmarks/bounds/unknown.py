@@ -134,8 +134,8 @@ class LoadChanges(NamedTuple):
 
     The flow at sample k - d - 1 is the last flow that can affect the output y(k), where d is
     the plant's delay in samples. The changes of the load at the samples from k - d to k are
-    unknown to a controller at sample k - d - 1. The load can change at every multiple of
-    `LOAD_INTERVAL` above 0.
+    unknown to a controller at sample k - d - 1. The load can change at every sample k above 0
+    that is a multiple of `LOAD_INTERVAL`.
     """
 
     # Effect on y(k), degC, of an unknown change of the load by 1 degC, in the order from the
@@ -187,7 +187,7 @@ def _after_jumps(
     amplitude
         Largest magnitude of a new level of the load, degC; levels are uniformly distributed.
     jump_probability
-        Probability that the load jumps at a sample at which the load can change.
+        Probability that the load jumps at a sample that is a multiple of `LOAD_INTERVAL`.
     """
     samples, changes = effects.shape
     no_jump_probability = 1.0 - jump_probability

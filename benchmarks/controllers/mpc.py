@@ -78,8 +78,8 @@ class _Model:
         plan
             The planned flows, t/h, shape (HORIZON, n).
         slopes
-            How fast the cost falls with each planned flow at a plan of zeros, degC^2 per t/h,
-            shape (HORIZON, n).
+            Negative derivative of the cost by each planned flow, at a plan of zeros, degC^2 per
+            t/h, shape (HORIZON, n).
         """
         quadratic = np.einsum("in,ijn,jn->n", plan, self.hessian, plan) / 2.0
         return np.asarray(quadratic - (slopes * plan).sum(axis=0))
@@ -265,7 +265,7 @@ class PredictiveController:
         return gain
 
     def _transition(self, k: int, plants: LinearModel) -> tuple[Array, Array]:
-        """Return the matrices F and Q of the Kalman filter for the step from k - 1 to k.
+        """Return the matrices F and Q of the Kalman filter for the step to sample k.
 
         F has the state transition matrices and Q the covariances of the process noise, both of
         shape (runs, size, size), where size is the length of the state. `plants` has the plants
@@ -326,8 +326,8 @@ class PredictiveController:
 
         A first flow inside the dead zone is replaced by 0 or by the flow at the edge of the
         dead zone, whichever gives the plan with the lower cost after the later flows have been
-        planned anew. A plan has the planned flows, t/h, shape (HORIZON, runs). The command is
-        in t/h, shape (runs,). `slopes` is the argument of `_Model.cost`.
+        planned anew. A plan has the planned flows of all runs, t/h, shape (HORIZON, runs). The
+        command is in t/h, shape (runs,). `slopes` is the argument of `_Model.cost`.
         """
         numbers = self._numbers
         flow = plan[0]

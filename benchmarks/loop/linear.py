@@ -298,7 +298,7 @@ def _time_of(level: float, response: Array) -> float:
 
 
 class LinearController(Protocol):
-    """A controller that is linear while the actuator applies the commands without change."""
+    """The interface of a controller with a linear transfer function."""
 
     def transfer(self) -> tuple[Array, Array]:
         """Return the transfer function from the error e (degC) to the command u (t/h).
