@@ -1,10 +1,10 @@
-"""Compute lower bounds of the mean error of every controller, and a reference error."""
+"""Compute lower bounds of the mean error of every controller, and reference errors."""
 
 from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """Import `least_possible` on its first use, as importing SciPy would delay `--help`."""
+    """Return `least_possible`, imported on first use: importing SciPy would delay `--help`."""
     if name != "least_possible":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from benchmarks.bounds.least import least_possible

@@ -1,4 +1,4 @@
-"""Print the least possible mean error: `python -m benchmarks.bounds --help`."""
+"""Print the least possible mean errors: `python -m benchmarks.bounds --help`."""
 
 import shutil
 import textwrap
@@ -22,10 +22,10 @@ from mptc_gym.evaluation import (
     VALIDATION_SEED,
 )
 
-# The heading of the column for each kind of bound.
+# Heading of the table's column for each kind of least possible error.
 HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
 HIDDEN_LOAD = "hidden load (estimate)"
-# What the columns of the table mean, by heading. The headings stand in the order of the table.
+# Explanation of each column of the table, by heading, in the order of the columns.
 COLUMNS = {
     "idle valve": "the error if the flow stays at 0 t/h.",
     "with preview": (
@@ -55,10 +55,10 @@ COLUMNS = {
 }
 INTERVALS = "Numbers in parentheses are 95 % confidence intervals over random episodes."
 
-# The file of the package `mptc_gym` that has the least possible errors of its presets.
+# File of the package `mptc_gym` with the least possible errors of the package's presets.
 PACKAGE_FILE = ROOT / "mptc_gym" / "bounds.json"
-# A published score has `EPISODES` episodes. The package has the bounds of 20 more episodes, so
-# that a somewhat longer evaluation can also be compared with bounds.
+# Number of episodes whose least possible errors the package has. Published scores use
+# `EPISODES` episodes; with 20 more, a somewhat longer evaluation also has a score.
 PACKAGED_EPISODES = EPISODES + 20
 PACKAGED = PRESETS | {
     f"{name}, random set points": {**PRESETS[name], "setpoint": "random"}
@@ -71,11 +71,12 @@ PACKAGED = PRESETS | {
 class Options:
     """Print the least possible mean error of each case.
 
-    By default, the cases are the cases of the comparison and the presets of the environment.
+    A case is a set of arguments of the environment. By default, the cases are the cases of
+    `python -m benchmarks.compare` and the presets of the environment.
     """
 
     mpc: Runs | None = None
-    """Add the mean error of model predictive control over this many runs of each case."""
+    """Number of runs of each case with model predictive control, whose mean error is added."""
     package: bool = False
     """Instead of the table, write the file of bounds that ships with the package mptc_gym."""
     fan_out: FanOut = field(default_factory=FanOut)
@@ -85,15 +86,15 @@ class Options:
     episodes: Count = EPISODES
     """Number of episodes over which a bound is averaged, if plants or set points are random."""
     seed: Seed = SEED
-    """Seed of the first episode."""
+    """Seed of the first episode; each later episode has the next seed."""
 
 
 def work(options: Options) -> str:
-    """Print a table of least possible mean errors, and return the closing text of the command.
+    """Print a table of least possible mean errors, and return an explanation of the columns.
 
-    The table has a row for each case, or for each case that has finished before an error or an
-    interruption. With the option `package`, the bounds that ship with the package are written
-    to a file, and no table is printed.
+    If an error or an interruption ends the computation, the table has only the finished cases.
+    If `options.package` is true, the file `mptc_gym/bounds.json` is written, no table is
+    printed, and a text with the path of the file is returned.
     """
     import pandas as pd
 
@@ -118,7 +119,7 @@ def work(options: Options) -> str:
 
 
 def description() -> str:
-    """Return a text that explains the columns of the table, broken to the terminal's width."""
+    """Return an explanation of the printed table's columns, wrapped at the terminal's width."""
     width = shutil.get_terminal_size((150, 24)).columns
     lines = ["", f"{INTERVALS} The columns of the table are:"]
     for heading, meaning in COLUMNS.items():
@@ -128,9 +129,11 @@ def description() -> str:
 
 
 def row(case: Scenario, options: Options) -> dict[str, str]:
-    """Return the cells of a case's row in the table: mean errors, degC, by column heading.
+    """Return a case's row of the printed table: mean errors, degC, as texts by column heading.
 
-    A cell is empty if the case has no bound of this kind, or no load that could be hidden.
+    The text is "" in the column "without preview" if set points are not random, in the column
+    "reference" if no reference exists, and in the column "hidden load (estimate)" if the case
+    has no load.
     """
     from benchmarks.bounds.least import least_possible, with_hidden_load
     from benchmarks.controllers.roster import ROSTER
@@ -145,7 +148,7 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
         **case.arguments,
     }
     cells = {"case": case.name}
-    # The text of an estimate, such as `f"{estimate:.4f}"`, has the interval in parentheses.
+    # Formatting an `Estimate`, as in f"{estimate:.4f}", adds the interval in parentheses.
     cells["idle valve"] = f"{least_possible(kind='preview', **arguments).idle:.4f}"
     for kind, heading in HEADINGS.items():
         cells[heading] = ""
@@ -161,9 +164,9 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
 
 
 def write_package(fan_out: FanOut) -> str:
-    """Write the file of least possible errors that ships with the package `mptc_gym`.
+    """Write the file `mptc_gym/bounds.json`, and return a text with the path of the file.
 
-    `fan_out` runs the cases in parallel. The closing line of the command is returned.
+    `fan_out` distributes the cases to worker processes.
     """
     tasks = {name: partial(packaged_case, arguments) for name, arguments in PACKAGED.items()}
     cases = dict(fan_out.stream(tasks, "bounds"))
@@ -184,12 +187,13 @@ def write_package(fan_out: FanOut) -> str:
 
 
 def packaged_case(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the entry of a case in the file of least possible errors.
+    """Return the least possible errors of a case for the file `mptc_gym/bounds.json`.
 
-    The list "least" has the bounds of the episodes of a published score, degC, or a single
-    number if all episodes have the same bound. If the bounds differ, the list
-    "validation_least" has the bounds of the episodes on which policies are selected.
-    `arguments` are the arguments of the environment.
+    `arguments` are the arguments of the environment that define the case. The list "least" has
+    the least possible mean error of each evaluation episode, degC, or a single number if all
+    episodes have the same least possible error. If the least possible error differs between
+    episodes, the list "validation_least" has the least possible mean error, degC, of each
+    episode with which trained policies are selected.
     """
     from benchmarks.bounds.least import least_possible
 

@@ -1,31 +1,36 @@
-"""Penalise flows that use the future, to bound the cost of not knowing the next set point.
+"""Compute a penalty for flows that use future set points, for the lower bound `causal`.
 
-With the environment's argument `setpoint="random"`, the set point is piecewise constant with a
-known distribution. The *levels*, the values between changes, are independent and uniformly
-distributed in [-A, A]. The number of samples for which a level lasts is uniformly distributed
-from S to L. The *age* of a level is the number of samples since the level began.
+With the environment's argument `setpoint="random"`, the set point is piecewise constant. The
+*levels*, which are the values of the set point between changes, are independent and uniformly
+distributed in [-A, A], degC. The number of samples for which the set point keeps a level is
+uniformly distributed from S to L. The *age* of a level is the number of samples since the set
+point changed to the level.
 
 A controller without preview learns of a change of the set point when the change happens, so the
-flow u_a(j) of the controller depends only on the set points up to j. For every price pi(j) of
-the flow with E[pi(j) | set points up to j] = 0, it follows that
+controller's flow u_a(j) at sample j depends only on the set points up to j. If the price pi(j)
+of a flow, in degC per t/h, satisfies E[pi(j) | set points up to j] = 0, then the mean cost of
+the flows of a controller without preview is 0:
 
     E[sum_j pi(j) u_a(j)] = 0.
 
-Hence the expected sum of errors |e(k)| of a controller without preview equals the expected sum
-of |e(k)| + pi(k) u_a(k). For fixed set points, the sum of |e(k)| + pi(k) u_a(k) has a minimum
-over all flows, even flows that use the future. The mean of these minima over random set points
-is a lower bound for every controller without preview (D. B. Brown, J. E. Smith and P. Sun,
-"Information relaxations and duality in stochastic dynamic programs", Operations Research 58,
-2010, 785-801). Every pi gives a valid bound, but a poor choice of pi makes the bound loose. The
-choice of pi in this module is
+So adding the costs pi(k) u_a(k) to the errors |e(k)| does not change the expected sum of the
+errors of a controller without preview. For given set points, the sum of |e(k)| + pi(k) u_a(k)
+over an episode has a minimum over all flows, even flows that use future set points. The mean of
+this minimum over random set points is a lower bound of the expected sum of |e(k)| for every
+controller without preview (Brown, Smith and Sun, "Information relaxations and duality in
+stochastic dynamic programs", Operations Research 58, 2010, 785-801). Every price whose mean is
+0, given the set points up to the sample of the flow, gives a valid lower bound, but a poor
+choice of the price gives a lower bound that is far below the error of real controllers. This
+module chooses the price
 
     pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
 
-G[k, j] is the effect of the flow u_a(j) on the output y(k). The *slope* g(k) is a rough
-estimate of how fast E|e(k)| rises with the expected error at k, in degC per degC. After a
-change of the set point, g is the sign of the change until the output can have reached the new
-level. Then g is a number between -1 and 1, which weighs staying at the present level against
-moving towards 0, the mean of the next level.
+The number G[k, j] is the effect of a flow of 1 t/h at sample j on the output y(k), degC. The
+*slope* g(k), a number from -1 to 1, estimates roughly how fast the mean error E|e(k)| rises
+with the expected error E[e(k)]. From a change of the set point until the output can have
+reached the new level, the slope g is the sign of the change. After the output can have reached
+the new level, the slope g is chosen so that an additional flow would not change the sum of the
+mean errors.
 """
 
 import numpy as np
@@ -39,35 +44,35 @@ from mptc_gym.plant.signals import SetPointLevels
 
 Array = NDArray[np.float64]
 
-# Number of thresholds of the error, equally probable, that represent the noise in the slope g.
-THRESHOLDS = 8
-# Largest steady-state gain, degC per t/h. It stands for the infinite gain of an integrating
-# plant, which can reach every temperature.
+# Number of equally probable magnitudes of the noise from which the slope g is computed.
+NOISE_MAGNITUDES = 8
+# Steady-state gain, degC per t/h, that replaces the infinite gain of an integrating plant.
 LARGEST_GAIN = 1e9
-SMALLEST_RANGE = 1e-9  # degC; least divisor, for set points and flows that are always 0
-# If the flow's limits keep the output from reaching a level, the output counts as having
-# arrived after four time constants. This is the share of the way after four time constants.
+SMALLEST_RANGE = 1e-9  # degC; a divisor in place of 0, if all set points and flows are 0
+# Share of the way to the farthest steady temperature that an output has made after four time
+# constants. An output that cannot reach a level counts as having arrived after this share.
 ARRIVED = 1.0 - np.exp(-4.0)
-# Samples after which the impulse response of the plant is neglected in the slope g.
+# Number of samples after which the slope g neglects the impulse response of the plant.
 HORIZON = 200
 
 
 class SetPointLaw:
-    """The distribution of random set points on one plant, and the penalty for using the future.
+    """The penalty for flows that use future set points, for random set points on one plant.
 
-    The slope g in the penalty is computed for the plant's dynamics at the start of the episode.
+    The description of the module defines the penalty and the slope g. The slope g is computed
+    for the plant's dynamics at the start of the episode.
 
     Parameters
     ----------
     model
-        The plant, for all samples of an episode.
+        Model of one plant at all samples of an episode.
     bounds
-        The lower bounds of the mean errors for this plant, from which the size of the noise
-        follows.
+        Lower bounds of the mean errors for the plant `model`. The standard deviation of the
+        noise is computed from the lower bounds.
     """
 
     def __init__(self, model: LinearModel, bounds: ErrorBounds) -> None:
-        samples = len(model.load)
+        samples = len(model.load_factor)
         parameters = model.parameters
         at_start = LinearModel(parameters, model.numbers, 0)
         self._flow_response = response(*equations(model, samples))
@@ -80,36 +85,36 @@ class SetPointLaw:
         low, high = model.limits
         gain = min(float(np.abs(at_start.gain)), LARGEST_GAIN)
         self._reachable = gain * min(-low, high)
-        # Noise makes the sign of a small error uncertain. Equally probable thresholds of the
-        # error, degC, represent the noise: quantiles of the magnitude of a normal number.
+        # Noise makes the sign of a small error uncertain. Equally probable magnitudes of the
+        # noise, degC, are quantiles of the magnitude of a normal random number.
         deviation = bounds.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
-        shares = (np.arange(THRESHOLDS) + 0.5) / THRESHOLDS
-        self._thresholds = np.zeros(1)
+        shares = (np.arange(NOISE_MAGNITUDES) + 0.5) / NOISE_MAGNITUDES
+        self._noise_magnitudes = np.zeros(1)
         if deviation > 0.0:
-            self._thresholds = deviation * scipy.special.ndtri((1.0 + shares) / 2.0)
-        # After a change of the set point, the output does not move for `lag` samples. Then the
-        # output approaches the farthest temperature that the limits allow. `_progress` is the
-        # share of this way that the output has made, by the age of the level.
+            self._noise_magnitudes = deviation * scipy.special.ndtri((1.0 + shares) / 2.0)
+        # For `lag` samples after a change of the set point, the output does not react. Later,
+        # the output approaches the farthest steady temperature within the limits of the flow.
+        # `_progress` is the share of the way to this temperature, by the age of the level.
         age = np.arange(samples)
         self._progress = 1.0 - at_start.slowest_pole ** np.maximum(age - model.lag + 1, 0)
-        # From this age on, the output has arrived at the new level after any change. The
-        # largest change within reach is from -amplitude to amplitude.
+        # Age of a level at which the output has arrived at the level after every change of the
+        # set point. The largest change is from -amplitude to amplitude.
         largest_way = max(self._reachable + self._amplitude, SMALLEST_RANGE)
         largest_share = 2.0 * self._amplitude / largest_way
         self._arrival_age = int(np.searchsorted(self._progress, min(largest_share, ARRIVED)))
-        # The probability that a level lasts beyond an age, by age.
+        # Probability that a level of the set point lasts longer than an age, by age.
         lengths = self._longest - self._shortest + 1
         self._probability_held = np.clip((self._longest - age) / lengths, 0.0, 1.0)
-        # The response to an impulse of 1 t/h of flow, degC, by the number of samples since the
-        # first sample at which the output reacts.
+        # The output's response to a flow of 1 t/h at one sample, degC. Element 0 is the first
+        # output that the flow can affect.
         zeros = model.lag - int(model.numbers.delay) - 1  # leading zeros of B
         self._impulse = at_start.impulse_response(samples + zeros)[zeros:]
 
     def penalty(self, setpoint: Array) -> Array:
         """Return the prices of the flows in one episode, degC per t/h, shape (samples,).
 
-        The price of the flow at sample j is pi(j) in the description of the module. `setpoint`
-        holds the set points of the episode, degC, shape (samples,).
+        The price of the flow at sample j is pi(j), which the description of the module defines.
+        `setpoint` has the set points of the episode, degC, shape (samples,).
         """
         samples = len(setpoint)
         slope = np.zeros(samples)  # g(k)
@@ -122,15 +127,15 @@ class SetPointLaw:
             slope_if_held = self._slope_after_change(previous_level, level)
             slope_if_held += self._slope_after_arrival(change_sums)
             slope[start:end] = slope_if_held[: end - start]
-            for j in range(start, end):  # The age of the level is j - start.
+            for j in range(start, end):  # The level has the age j - start.
                 later_ages = np.arange(j + 1 - start, samples - start)
                 expected[j + 1 :, j] = self._expected_slope(
                     later_ages, j - start, slope_if_held, change_sums
                 )
             previous_level = level
-        # Only slopes after j are unexpected at j.
-        surprise = np.tril(slope[:, np.newaxis] - expected, k=-1)
-        return np.asarray(np.einsum("kj,kj->j", self._flow_response, surprise))
+        # At sample j, only the slopes at later samples are unknown.
+        unexpected = np.tril(slope[:, np.newaxis] - expected, k=-1)
+        return np.asarray(np.einsum("kj,kj->j", self._flow_response, unexpected))
 
     def _expected_slope(
         self,
@@ -139,25 +144,15 @@ class SetPointLaw:
         slope_if_held: Array,
         change_sums: Array,
     ) -> Array:
-        """Return the mean slopes of the error, given that a level has reached an age.
+        """Return the mean slopes dE|e|/dE[e] at `ages` of a level of the set point.
 
-        Parameters
-        ----------
-        ages
-            Ages of the level at which the means are wanted, samples, all above `known_age`.
-        known_age
-            Age up to which the level is known not to change, samples.
-        slope_if_held
-            The slope by age if the level never changes, shape (samples,).
-        change_sums
-            What `_sums_after_next_change` returns for the level.
-
-        Returns
-        -------
-        ndarray
-            The conditional means of the slope, in the shape of `ages`.
+        The means are conditional on no change of the set point up to the age `known_age`, in
+        samples, which is lower than all elements of `ages`. `slope_if_held` has the slope at
+        each age of a level that never changes. `change_sums` has the cumulative sums that
+        `_sums_after_next_change` returns for the level of the set point.
         """
-        # The next level begins at an age from `first` to `longest`, all equally probable.
+        # The set point changes to the next level at an age of the present level from `first` to
+        # `longest`; all these ages are equally probable.
         first = max(self._shortest, known_age + 1)
         count = self._longest - first + 1
         change_probability = np.clip((ages - first + 1) / count, 0.0, 1.0)
@@ -166,64 +161,65 @@ class SetPointLaw:
         return expected
 
     def _slope_after_change(self, previous_level: float, level: float) -> Array:
-        """Return the slopes of the error after a change of the set point, shape (samples,).
-
-        Element i is the slope at the age i of the new level: an estimate of how fast the mean
-        absolute error rises with the expected error, from -1 to 1.
+        """Return the slopes dE|e|/dE[e] after a change of the set point, shape (samples,).
 
         The set point changes from `previous_level` to `level`, degC. The slope is the sign of
-        the change times the probability that the error is larger than the noise. The slope is 0
-        after the output has arrived at the new level.
+        the change times the probability that the error is larger than the noise, and 0 after
+        the output has arrived at the new level.
         """
         change = level - previous_level
         way = max(self._reachable - np.sign(change) * previous_level, 0.0)
         remaining = np.abs(change) - way * self._progress[:, np.newaxis]
-        slope: Array = np.sign(change) * (remaining > self._thresholds).mean(axis=1)
+        slope: Array = np.sign(change) * (remaining > self._noise_magnitudes).mean(axis=1)
         slope[self._arrival_age :] = 0.0
         return slope
 
     def _mean_slope_after_change(self, level: float) -> Array:
-        """Return the mean of `_slope_after_change` over all next levels, shape (samples,).
+        """Return the mean of `_slope_after_change` over all new levels, shape (samples,).
 
-        The set point changes from `level`, degC, to a next level that is uniformly distributed.
-        Element i is the mean slope at the age i of the next level.
+        The set point changes from `level`, degC, to a new level that is uniformly distributed
+        from -A to A, where A is the amplitude of the set points, degC.
         """
         A = self._amplitude
         progress = self._progress[:, np.newaxis]
         way_up = max(self._reachable - level, 0.0)
         way_down = max(self._reachable + level, 0.0)
-        # Lengths of the intervals of next levels that the output has not reached.
-        above = np.maximum(A - level - way_up * progress - self._thresholds, 0.0)
-        below = np.maximum(A + level - way_down * progress - self._thresholds, 0.0)
+        # New levels that the output has not reached yet form an interval above the temperature
+        # of the output and an interval below it. The lengths of the two intervals are, in degC:
+        above = np.maximum(A - level - way_up * progress - self._noise_magnitudes, 0.0)
+        below = np.maximum(A + level - way_down * progress - self._noise_magnitudes, 0.0)
         mean: Array = (above - below).mean(axis=1) / (2.0 * A)
         mean[self._arrival_age :] = 0.0
         return mean
 
     def _sums_after_next_change(self, level: float) -> Array:
-        """Return cumulative sums of the mean slopes after the next change from `level`, degC.
+        """Return cumulative sums of mean slopes after the set point leaves `level`, degC.
 
-        The element `longest + 1 + i` is the sum over the samples from the change to i samples
-        after the change. The first `longest + 1` elements, for samples before the change, are
-        0.
+        Element `longest + 1 + i` is the sum of the mean slopes dE|e|/dE[e] from the change to i
+        samples after the change, where `longest` is the largest number of samples for which a
+        level lasts. The first `longest + 1` elements, for samples before the change, are 0.
         """
-        # After a second change, the mean slope is 0, as levels are symmetric around 0.
+        # After a second change, the mean slope is 0, since the distribution of levels is
+        # symmetric around 0.
         mean_slope = self._mean_slope_after_change(level) * self._probability_held
         return np.append(np.zeros(self._longest + 1), np.cumsum(mean_slope))
 
     def _slope_after_arrival(self, change_sums: Array) -> Array:
-        """Return the slopes of the error after the output has arrived at a level, by age.
+        """Return the slopes dE|e|/dE[e] after the output has arrived at a level, by age.
 
-        The slopes solve an equation for each age: an additional flow that acts from the age on
-        does not change the mean error. So the sum of the impulse response times the mean slopes
-        is 0. The equation of the highest age is solved first. `change_sums` is what
-        `_sums_after_next_change` returns for the level.
+        The slope at an age solves an equation: an additional flow whose first effect is at this
+        age does not change the sum of the mean errors, so the sum of the impulse response times
+        the mean slopes is 0. The equations are solved from the highest age to the lowest age,
+        since the slope at an age depends on the slopes at all higher ages. `change_sums` has
+        the cumulative sums that `_sums_after_next_change` returns for the level of the set
+        point.
         """
         samples = len(self._probability_held)
         slope = np.zeros(samples)
         if not self._impulse[0]:  # No flow has an effect.
             return slope
         for age in range(min(self._longest, samples) - 1, self._arrival_age - 1, -1):
-            known_age = age - self._lag  # when the flow is chosen
+            known_age = age - self._lag  # the age when the flow is chosen
             ages = np.arange(age, min(samples, age + HORIZON))
             expected = self._expected_slope(ages, known_age, slope, change_sums)
             effect_of_flow = self._impulse[: len(ages)] @ expected

@@ -1,4 +1,4 @@
-"""Add, mix and simplify discrete distributions, for all samples of an episode at once."""
+"""Add, mix and simplify discrete probability distributions, one for each sample."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,27 +9,30 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-ROUNDING = 1e-12  # bound of the rounding error of a sum of probabilities
+ROUNDING = 1e-12  # largest rounding error of a sum of probabilities
 
 
 class Distribution(NamedTuple):
-    """A discrete distribution for each sample of an episode: finitely many values, or atoms."""
+    """A discrete probability distribution for each sample of an episode.
 
-    values: Array  # degC, shape (samples, atoms)
+    An *atom* is one of the finitely many values of a distribution.
+    """
+
+    values: Array  # the atoms, degC, shape (samples, atoms)
     weights: Array  # probabilities of the values, shape (samples, atoms)
 
 
 def normal(variance: Array, atoms: int) -> Distribution:
-    """Return normal distributions with the mean 0, each as equally probable atoms.
+    """Return normal distributions with mean 0, approximated by equally probable values.
 
     Parameters
     ----------
     variance
-        The variance of each sample's distribution, degC^2, shape (samples,).
+        Variance of the distribution at each sample, degC^2, shape (samples,).
     atoms
-        Number of atoms of each distribution.
+        Number of values of each distribution.
     """
-    # The atoms are means of equally probable slices of the standard normal distribution,
+    # The values are the means of equally probable slices of the standard normal distribution,
     # computed without scipy.stats, which takes long to import.
     ends = scipy.special.ndtri(np.linspace(0.0, 1.0, atoms + 1))
     densities = np.exp(-(ends**2) / 2.0) / np.sqrt(2.0 * np.pi)
@@ -39,17 +42,17 @@ def normal(variance: Array, atoms: int) -> Distribution:
 
 
 def uniform(half_width: Array, atoms: int) -> Distribution:
-    """Return uniform distributions with the mean 0, each as equally probable atoms.
+    """Return uniform distributions with mean 0, approximated by equally probable values.
 
     Parameters
     ----------
     half_width
-        Half the width of each sample's distribution, degC, shape (samples,). The sign of a half
-        width has no meaning.
+        Half the width of the distribution at each sample, degC, shape (samples,). The sign of a
+        half width has no effect on the distribution.
     atoms
-        Number of atoms of each distribution.
+        Number of values of each distribution.
     """
-    # The means of equal slices of the interval from -1 to 1.
+    # Means of equally long parts of the interval from -1 to 1.
     means = (np.arange(atoms) + 0.5) / atoms * 2.0 - 1.0
     values = half_width[:, np.newaxis] * means
     return Distribution(values, np.full(values.shape, 1.0 / atoms))
@@ -58,8 +61,8 @@ def uniform(half_width: Array, atoms: int) -> Distribution:
 def sum_of(first: Distribution, second: Distribution, atoms: int) -> Distribution:
     """Return the distribution of the sum of two independent random numbers, for each sample.
 
-    `atoms` is the number of atoms of the result. The number must divide the product of the
-    numbers of atoms of `first` and `second`.
+    `atoms`, the number of values of the returned distribution, must divide the number of values
+    of `first` times the number of values of `second`.
     """
     samples = len(first.values)
     values = first.values[:, :, np.newaxis] + second.values[:, np.newaxis]
@@ -69,10 +72,11 @@ def sum_of(first: Distribution, second: Distribution, atoms: int) -> Distributio
 
 
 def mixture(parts: Sequence[Distribution], probabilities: Sequence[Array]) -> Distribution:
-    """Return the distribution of a random number that comes from one of `parts`, by chance.
+    """Return the distribution of a random number that follows one of `parts`, chosen at random.
 
-    `probabilities` holds the probability of each part, by sample, shape (samples,). The atoms
-    of the mixture are the atoms of all parts, in the order of the parts.
+    `probabilities` has the probability of each part at each sample, in arrays of shape
+    (samples,). The values of the returned distribution are the values of all parts, in the
+    order of the parts.
     """
     weights = [
         probability[:, np.newaxis] * part.weights
@@ -82,8 +86,8 @@ def mixture(parts: Sequence[Distribution], probabilities: Sequence[Array]) -> Di
 
 
 def in_ascending_order(distribution: Distribution) -> Distribution:
-    """Return a distribution with the values of each sample in ascending order."""
-    # A stable sort is fast where the values are a few ascending rows one after another.
+    """Return a distribution with the values of each sample sorted in ascending order."""
+    # A stable sort is fast, since the values of a mixture consist of a few ascending sequences.
     order = np.argsort(distribution.values, axis=1, kind="stable")
     values = np.take_along_axis(distribution.values, order, axis=1)
     weights = np.take_along_axis(distribution.weights, order, axis=1)
@@ -91,13 +95,13 @@ def in_ascending_order(distribution: Distribution) -> Distribution:
 
 
 def reduced(distribution: Distribution, atoms: int) -> Distribution:
-    """Return a distribution with fewer atoms, the means of groups of neighbouring atoms.
+    """Return a distribution in which groups of neighbouring values are replaced by their means.
 
-    `atoms` is the number of atoms that remain for each sample, a divisor of the number of atoms
-    of `distribution`.
+    `atoms` is the number of values that remain at each sample, a divisor of the number of
+    values of `distribution`.
     """
     ascending = in_ascending_order(distribution)
-    groups = len(distribution.values), atoms, -1  # shape (samples, atoms, atoms of a group)
+    groups = len(distribution.values), atoms, -1  # shape (samples, groups, values in a group)
     values = ascending.values.reshape(groups)
     weights = ascending.weights.reshape(groups)
     totals = weights.sum(axis=2)
@@ -107,23 +111,23 @@ def reduced(distribution: Distribution, atoms: int) -> Distribution:
 
 
 def least_mean_distances(distribution: Distribution, slopes: Array) -> Array:
-    """Return the minimum over all x of E|x - n| - s x for each slope s and each sample, degC.
+    """Return the minimum over x of E|x - n| - s x for each random number n and each slope s.
 
     Parameters
     ----------
     distribution
         Distribution of the random number n at each sample, degC.
     slopes
-        The slopes s, from -1 to 1, shape (slopes,).
+        Slopes s, numbers from -1 to 1, shape (slopes,).
 
     Returns
     -------
     ndarray
-        Shape (samples, slopes).
+        Minima, degC, shape (samples, slopes).
     """
     values, weights = in_ascending_order(distribution)
-    # For each value: the probability that n is at most this value, and the part of the mean of
-    # n that comes from such numbers.
+    # For each value: the probability that n is at most this value, and the sum of probability
+    # times value over all values up to this value.
     probability = weights.cumsum(axis=1)
     partial_mean = (weights * values).cumsum(axis=1)
     mean = partial_mean[:, -1]
@@ -131,9 +135,9 @@ def least_mean_distances(distribution: Distribution, slopes: Array) -> Array:
     k = np.arange(samples)
     minima = np.empty((samples, len(slopes)))
     for i, slope in enumerate(slopes):
-        # The minimum is at the quantile of probability (1 + s) / 2. As sums are rounded, the
-        # quantile may be its neighbour, where E|x - n| - s x is as small. If x is a value of n,
-        # then E|x - n| = mean - 2 partial_mean + (2 probability - 1) x.
+        # The minimum is at the quantile of n for the probability (1 + s) / 2. Rounding of sums
+        # may select a neighbour of the quantile, at which E|x - n| - s x is as small. If x is a
+        # value of n, then E|x - n| = mean - 2 partial_mean + (2 probability - 1) x.
         is_below = probability < (1.0 + slope) / 2.0 - ROUNDING
         quantile = np.minimum(is_below.sum(axis=1), atoms - 1)
         x = values[k, quantile]

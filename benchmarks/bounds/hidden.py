@@ -1,16 +1,18 @@
-"""Estimate how much the least possible error grows because no controller measures the load.
+"""Estimate the least possible error of controllers that cannot measure the load.
 
-The bounds of `least.py` assume that the load is known up to the sample k - d - 1, where d is
-the plant's delay. A real controller has only the transmitter's readings, in which noise hides
-the load. No lower bound is known for controllers that have only readings, so this module
-estimates their least possible error. Reports show the estimate as "hidden load".
+A lower bound of `least.py` holds for controllers that know the load up to the sample k - d - 1,
+where d is the plant's delay in samples. A real controller has only the transmitter's readings,
+in which noise hides the load. No lower bound is known for controllers that have only readings,
+so this module estimates the least possible error of these controllers. Reports show the
+estimate in the column "hidden load".
 
-The estimate is the bound plus the increase of the least possible error from a known load to a
-hidden load, for a load that is normally distributed with the variances and correlations of the
-real load. With a normal load, the unknown part of the output y(k) is normal, and a Kalman
-filter gives the variance of this part. A load that jumps causes smaller errors than a normal
-load with the same variance, but most of this difference cancels when the two least possible
-errors are subtracted.
+The estimate for a hidden load is a lower bound for a known load plus the increase of the least
+possible error from a known load to a hidden load. The increase of the least possible error is
+computed for a normally distributed load that has the variances and correlations of the real
+load. With a normal load, the unknown part of the output y(k) is normal, and a Kalman filter
+gives the variance of the unknown part. A load that jumps causes smaller errors than a normal
+load with the same variance, but most of this difference cancels when the least possible error
+with a known load is subtracted from the least possible error with a hidden load.
 """
 
 import numpy as np
@@ -30,22 +32,23 @@ Array = NDArray[np.float64]
 
 
 def bounds_with_known_load(model: LinearModel) -> ErrorBounds:
-    """Return the lower bounds of the mean errors at k for a load that is known up to k - d - 1.
+    """Return lower bounds of the mean errors at k if the load is known up to k - d - 1.
 
-    Here d is the plant's delay, and the load is taken to be normal. `model` is the plant, for
-    the samples k = 0, 1, ... of an episode.
+    The number d is the plant's delay in samples. The load is taken to be normally distributed.
+    `model` is the plant at the samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)
-    filtered = np.zeros_like(F)  # A known load has no variance.
+    filtered = np.zeros_like(F)  # The variance of a known load is 0.
     filtered[:, :LOAD_STEPS, :LOAD_STEPS] = noise_covariance(model)
     return bounds_for_normal(predicted_variance(filtered, F, Q, model.lag))
 
 
 def bounds_with_hidden_load(model: LinearModel) -> ErrorBounds:
-    """Return the lower bounds of the mean errors at k for readings up to k - d - 1 alone.
+    """Return lower bounds of the mean errors if only the transmitter's readings are known.
 
-    Here d is the plant's delay, and the load is unknown and taken to be normal. `model` is the
-    plant, for the samples k = 0, 1, ... of an episode.
+    For the error at sample k, the readings up to k - d - 1 are known, where d is the plant's
+    delay in samples. The load is taken to be normally distributed. `model` is the plant at the
+    samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)
     filtered = filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
@@ -53,24 +56,26 @@ def bounds_with_hidden_load(model: LinearModel) -> ErrorBounds:
 
 
 def _with_load(model: LinearModel) -> tuple[Array, Array]:
-    """Return F(k) and Q(k) of x(k) = F(k) x(k-1) + v(k) for a plant with a normal load.
+    """Return F(k) and Q(k) of the state equation of a plant with a normally distributed load.
 
-    The state x(k) is the state of `LinearModel.state_space_with_load`, and v(k) is white with
-    the covariance Q(k). F and Q have the shape (samples, size, size).
+    The state equation is x(k) = F(k) x(k-1) + v(k), where x(k) is the state of
+    `LinearModel.state_space_with_load`, and v(k) is white noise with the covariance matrix
+    Q(k). F and Q have the shape (samples, size, size), where size is the length of x(k).
     """
     numbers = model.numbers
-    k = np.arange(len(model.load))
+    k = np.arange(len(model.load_factor))
     is_change = (k % LOAD_INTERVAL == 0) & (k > 0)
     jump_probability = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval)
-    # The mean of the piecewise constant part at k, as a share of its value at k - 1.
-    stays = np.where(is_change, 1.0 - jump_probability, 1.0)
-    # The piecewise constant part is 0 until its first jump, and uniformly distributed after it.
-    probability_of_jump_before = 1.0 - np.cumprod(stays)
+    # The probability that the piecewise constant part of the load does not jump at sample k.
+    no_jump_probability = np.where(is_change, 1.0 - jump_probability, 1.0)
+    # The piecewise constant part of the load is 0 until the first jump, and uniformly
+    # distributed after the first jump.
+    probability_of_jump_before = 1.0 - np.cumprod(no_jump_probability)
     level_variance = probability_of_jump_before * numbers.disturbance_amplitude**2 / 3.0
     previous_variance = np.append(0.0, level_variance[:-1])
-    step_variance = level_variance - np.square(stays) * previous_variance
+    step_variance = level_variance - np.square(no_jump_probability) * previous_variance
     walk_variance = is_change * LOAD_INTERVAL * numbers.disturbance_walk_variance
     noise_variance = np.full(len(k), numbers.noise_variance)
     variances = np.stack([noise_variance, step_variance, walk_variance], axis=1)
-    F, E = model.state_space_with_load(stays)
+    F, E = model.state_space_with_load(no_jump_probability)
     return F, np.einsum("kv,kiv,kjv->kij", variances, E, E)

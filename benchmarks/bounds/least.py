@@ -1,11 +1,13 @@
-"""Compute the least possible mean error of a case of the environment, and scores.
+"""Compute the least possible mean error for given arguments of the environment, and scores.
 
 The mean error is the mean of |e(k)| over the samples k = 1 to N of an episode, where e(k) is
-the set point minus the output, degC. The file README.md says for which controllers each kind of
-bound holds. At sample k, a controller may know the plant's parameters, and the transmitter's
-readings, the set points and the loads up to k. A controller knows neither the true output,
-`info["output"]`, nor the time of the load's next jump. A controller may compensate the dead
-zone.
+the set point minus the output, degC. The file README.md in this folder says for which
+controllers each kind of least possible error holds.
+
+At sample k, a controller may know the plant's parameters, and the transmitter's readings, the
+set points and the loads up to k. No controller knows the true output, `info["output"]`, or the
+time at which the load jumps next. A controller may compensate for the dead zone of the
+actuator.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,24 +46,25 @@ from mptc_gym.plant.sampling import plant_numbers
 
 Array = NDArray[np.float64]
 
-# "preview": a lower bound for controllers that know future set points; "causal": a lower bound
-# for controllers that do not; "reference": the least error of a controller that expects no
-# change of the set point.
+# Kinds of least possible errors. "preview": a lower bound for controllers that know future set
+# points; "causal": a lower bound for controllers that do not know future set points;
+# "reference": the least error of a controller that expects no change of the set point.
 KINDS = "preview", "causal", "reference"
 
 
 @dataclass(frozen=True)
 class LeastPossible(Estimate):
-    """The least possible mean |e| of a case, degC, with a 95 % interval over random episodes.
+    """The least possible mean error |e|, degC, with a 95 % confidence interval.
 
-    The interval has the length 0 if the least error is the same in all episodes.
+    The confidence interval is for the mean over random episodes, and has the length 0 if all
+    episodes have the same least possible error.
     """
 
     kind: str  # one of `KINDS`
-    idle: Estimate  # mean |e| of the same episodes with an idle valve, degC
-    # The least errors of the episodes with the seeds `seed + i`, degC; `value` is their mean.
-    # There is a single number if the least error is the same in all episodes. For the kind
-    # "causal", the mean is a bound, but the numbers of single episodes are not.
+    idle: Estimate  # mean |e| with a flow of 0 t/h in the same episodes, degC
+    # Least possible error of each episode, degC, or a single number if all episodes have the
+    # same. The field `value` is the mean over the episodes. For the kind "causal", the mean is
+    # a lower bound, but the number of a single episode is not.
     episodes: tuple[float, ...]
 
     def score(self, errors: ArrayLike) -> Array:
@@ -80,11 +83,14 @@ class LeastPossible(Estimate):
         Raises
         ------
         ValueError
-            If the least possible error is not below the error of an idle valve.
+            If the error of an idle valve is not above the least possible error.
         """
         idle = self.idle.value
         if idle - self.value <= 1e-9 * max(idle, 1.0):
-            raise ValueError(f"there is nothing to gain: an idle valve gives {idle:g} °C")
+            raise ValueError(
+                f"a score needs an idle-valve error above the least possible error of "
+                f"{self.value:g} °C, got {idle:g} °C"
+            )
         scores: Array = (idle - np.asarray(errors, np.float64)) / (idle - self.value)
         return scores
 
@@ -97,30 +103,29 @@ def least_possible(
     seed: int = SEED,
     **arguments: Any,
 ) -> LeastPossible:
-    """Return the least possible mean |e(k)| of a case over k = 1 to `samples`, degC.
+    """Return the least possible mean error |e(k)| over the samples k = 1 to `samples`, degC.
 
     Parameters
     ----------
     samples
-        N, the length of an episode.
+        Length of an episode, samples.
     kind
-        One of `KINDS`. With None, as in reports and in `mptc_gym.evaluate`, the kind is
-        "causal" for random set points, "preview" for constant set points, and otherwise
-        "reference", or "preview" if the case has no reference.
+        Kind of the least possible error, one of `KINDS`. If `kind` is None, as in reports and
+        in `mptc_gym.evaluate`, the kind is "causal" for random set points, "preview" for
+        constant set points, and otherwise "reference", or "preview" if no reference exists.
     episodes
-        Number of episodes over which the least error is averaged, if plants or set points are
-        random.
+        Number of episodes over which the least possible error is averaged, if plants or set
+        points are random.
     seed
-        Seed of the first episode: episode i is the environment's episode with the seed
-        `seed + i`.
+        Seed of the first episode; episode i has the seed `seed + i`.
     **arguments
-        Arguments of the environment, which define the case.
+        Arguments of the environment `MiddlePoint-v0`.
 
     Raises
     ------
     NoBoundError
-        If the case has no bound of this kind: "causal" needs random set points, and "reference"
-        needs set points that do not change before the plant has settled.
+        If `kind` is "causal" and set points are not random, or if `kind` is "reference" and the
+        set point changes before the plant has settled.
     ValueError
         If `samples`, `episodes`, `kind` or an argument of the environment is not allowed.
     """
@@ -133,8 +138,8 @@ def least_possible(
     has_random_setpoint = parameters.setpoint == "random"
     if kind == "causal" and not has_random_setpoint:
         raise NoBoundError(
-            f"kind must be preview or reference, as the set point {parameters.setpoint!r} is "
-            f"not random, got {kind!r}"
+            f"kind must be 'preview' or 'reference' if the set point is not random, got "
+            f"{kind!r} for the set point {parameters.setpoint!r}"
         )
     case = parameters, samples, episodes, seed
     if kind is not None:
@@ -142,7 +147,7 @@ def least_possible(
     if has_random_setpoint:
         return _bound(*case, "causal")
     setpoint = _episodes_of(parameters, samples, 1, seed).setpoints[0]
-    if np.ptp(setpoint) == 0.0:  # Without a change, foresight makes no difference.
+    if np.ptp(setpoint) == 0.0:  # The set point is constant.
         return _bound(*case, "preview")
     try:
         return _bound(*case, "reference")
@@ -153,10 +158,11 @@ def least_possible(
 def with_hidden_load(
     *, samples: int, episodes: int = EPISODES, seed: int = SEED, **arguments: Any
 ) -> Estimate:
-    """Return an estimate of the least possible mean |e(k)| if nobody measures the load, degC.
+    """Return an estimate of the least possible mean |e(k)| if the load is not measured, degC.
 
-    The estimate is not a bound: see `hidden.py`. For a case without a load, the result is the
-    least possible error. `least_possible` describes the parameters and exceptions.
+    The estimate for a hidden load, which `hidden.py` derives, is not a lower bound. If the
+    plant has no load, the least possible error is returned. `least_possible` describes the
+    parameters and exceptions.
     """
     least = least_possible(samples=samples, episodes=episodes, seed=seed, **arguments)
     parameters = Parameters(**arguments)
@@ -165,7 +171,7 @@ def with_hidden_load(
     sampled = _episodes_of(parameters, samples, len(least.episodes), seed)
     estimates = []
     for i, bound in enumerate(least.episodes):
-        # The first arguments of `_error_sum`.
+        # The arguments of `_error_sum` before `bounds_of`.
         episode = parameters, least.kind, sampled.numbers[i], sampled.setpoints[i]
         hidden_load = _error_sum(*episode, bounds_with_hidden_load)
         known_load = _error_sum(*episode, bounds_with_known_load)
@@ -174,9 +180,9 @@ def with_hidden_load(
 
 
 class _Episodes(NamedTuple):
-    """Plant numbers, set points and idle-valve errors of some episodes of N samples."""
+    """Parameter values of the plants, set points and idle-valve errors of several episodes."""
 
-    numbers: Sequence[PlantNumbers[float]]  # the plant numbers of each episode
+    numbers: Sequence[PlantNumbers[float]]  # parameter values of each plant
     setpoints: Array  # y_d(k) for k = 0 to N, degC, shape (episodes, N + 1)
     # Mean |e(k)| over k = 1 to N with an idle valve, degC, shape (episodes,).
     idle_errors: Array
@@ -198,14 +204,14 @@ def _episodes_of(parameters: Parameters, samples: int, episodes: int, seed: int)
     )
 
 
-@cache  # as a report asks for the same bound several times
+@cache  # since reports need the same bound several times
 def _bound(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
-    """Return the least possible error of one of `KINDS`.
+    """Return the least possible mean error, degC, of one of `KINDS`.
 
-    `least_possible` describes the parameters. A NoBoundError is raised if the reference does
-    not exist.
+    `least_possible` describes the parameters. A NoBoundError is raised if `kind` is "reference"
+    and no reference exists.
     """
     if not is_random(parameters):
         episodes = 1
@@ -216,7 +222,7 @@ def _bound(
     values = []
     for i in range(bounds):
         error_sum = _error_sum(parameters, kind, sampled.numbers[i], sampled.setpoints[i])
-        # Rounded to be the same on all machines, as solvers differ in later digits.
+        # Solvers differ between machines in later digits.
         values.append(round(error_sum / samples, 6))
     idle = student(sampled.idle_errors)
     return LeastPossible(**vars(student(values)), kind=kind, idle=idle, episodes=tuple(values))
@@ -231,25 +237,17 @@ def _error_sum(
 ) -> float:
     """Return the least possible sum of |e(k)| over k = 1 to N in one episode, degC.
 
-    For the kind "causal", the sum contains the penalty for flows that use the future, and only
-    the mean over many episodes is a bound. For the kind "reference", the sum contains a small
-    price of valve travel: solvers agree on the sum with the price, but not without it.
+    For the kind "causal", the sum contains the penalty for flows that use future set points,
+    and only the mean of the sum over many episodes is a lower bound. For the kind "reference",
+    the sum contains a small price of valve travel: solvers agree on the sum with the price, but
+    not on the sum without the price.
 
-    Parameters
-    ----------
-    parameters
-        The arguments of the environment.
-    kind
-        One of `KINDS`.
-    numbers
-        The plant numbers of the episode.
-    setpoint
-        Set points y_d(k) for k = 0 to N, degC, shape (N + 1,).
-    bounds_of
-        A function that returns the lower bounds of the mean errors for a plant.
+    `numbers` has the parameter values of the episode's plant, and `setpoint` has the set points
+    y_d(k) for k = 0 to N, degC. `bounds_of` returns the lower bounds of the mean errors for a
+    plant.
     """
     length = len(setpoint)
-    if kind == "reference":  # A reference looks beyond the end of the episode.
+    if kind == "reference":  # A reference plans beyond the end of the episode.
         length += int(numbers.delay) + len(parameters.b) + LOOKAHEAD
     model = LinearModel(parameters, numbers, np.arange(length))
     bounds = bounds_of(model)
@@ -262,4 +260,4 @@ def _error_sum(
             penalty = SetPointLaw(model, bounds).penalty(setpoint)
         errors, flow = plan(model, bounds, setpoint, penalty=penalty)
         costs = penalty * flow
-    return float(errors[1:].sum() + costs.sum())  # without e(0), which no flow changes
+    return float(errors[1:].sum() + costs.sum())  # without e(0), which no flow affects

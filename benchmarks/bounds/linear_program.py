@@ -1,4 +1,4 @@
-"""Solve the linear program behind every bound, and plan the flow of a reference."""
+"""Find the flows with the least expected error in an episode by linear programming."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,23 +14,23 @@ from benchmarks.loop.rollout import held
 
 Array = NDArray[np.float64]
 
-# Effects of a flow on an output below this fraction of the largest effect are set to 0, so that
-# the matrix of a linear program is sparse.
+# Effects of a flow on an output that are smaller than this fraction of the largest effect are
+# set to 0, so that the matrix of the linear program is sparse.
 NEGLIGIBLE_RESPONSE = 1e-9
-# Pairs of a method of `scipy.optimize.linprog` and whether its solver, HiGHS, simplifies the
-# program first. For a few plants a pair fails, and the next pair is tried.
+# Values of the arguments `method` and `presolve` of `scipy.optimize.linprog`. The pairs are
+# tried in turn, since a pair fails for a few plants.
 SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)
 TIME_LIMIT = 30.0  # s for each attempt; most programs take less than 1 s
 
 # A plant counts as settled if the flow stays within this fraction of the actuator's range for
 # the lag of the plant, the time from a flow to its first effect.
 SETTLED_FLOW_RANGE = 0.05
-# Samples by which the plan of a reference looks beyond a change of the set point, in addition
-# to the lag. With more samples the references of the presets are the same.
+# Number of samples by which the plan of a reference looks beyond a change of the set point, in
+# addition to the lag. With more samples, the references of the presets would be the same.
 LOOKAHEAD = 60
-# Two small prices that select among plans with equal errors; the price of an error is 1. With
-# `SMALLEST_SLOPE`, degC for each degC, a plan ends at the set point. With `TRAVEL_PRICE`, degC
-# for each t/h of valve travel, the valve moves no more than needed.
+# Two small prices that select one of several plans with equal errors. With `SMALLEST_SLOPE`,
+# the least slope of an error bound, a plan ends at the set point. With `TRAVEL_PRICE`, degC per
+# t/h of valve travel, the valve moves no more than needed.
 SMALLEST_SLOPE = 0.001
 TRAVEL_PRICE = 1e-4
 
@@ -39,18 +39,19 @@ TRAVEL_PRICE = 1e-4
 class ErrorBounds:
     """Lower bounds of the mean absolute error E|e| at each sample, as functions of |E[e]|.
 
-    A bound is the highest of several lines, intercept + slope * |E[e]|; see `unknown.py`.
+    The lower bound at a sample is the maximum of several lines, intercept + slope * |E[e]|,
+    which the module `unknown.py` derives.
     """
 
     # The slopes of the lines, ascending from 0 to 1, shape (slopes,). If neither noise nor load
     # is random, the only slope is 1.
     slopes: Array
-    intercepts: Array  # of the lines at each sample, degC, shape (samples, slopes)
+    intercepts: Array  # intercepts of the lines, degC, shape (samples, slopes)
 
     def mean_error(self, expected_errors: Array) -> Array:
         """Return the lower bounds of the mean absolute errors E|e|, degC, shape (count,).
 
-        `expected_errors` holds the expected errors E[e] of the first samples, degC, shape
+        `expected_errors` has the expected errors E[e] at the first `count` samples, degC, shape
         (count,).
         """
         magnitudes = np.abs(expected_errors)[:, np.newaxis]
@@ -59,10 +60,10 @@ class ErrorBounds:
 
     @property
     def lengths(self) -> Array:
-        """For each line, the length of the interval on which the line is the highest, degC.
+        """Length of the range of |E[e]| in which each line of a bound is the highest, degC.
 
-        The intervals divide the magnitudes of the expected error from 0 to infinity. The
-        lengths have the shape (samples, slopes), and the last length is infinite.
+        The lengths have the shape (samples, slopes). The last length at each sample is
+        infinite, since the steepest line is the highest line for all large values of |E[e]|.
         """
         ends = np.full(self.intercepts.shape, np.inf)
         corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
@@ -73,8 +74,8 @@ class ErrorBounds:
 def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
     """Return the matrices A and B of A y = B u, the plant without noise and load.
 
-    The vectors y and u hold the outputs, degC, and the applied flows, t/h, of all `samples` of
-    an episode from rest. The matrix equation is equation (28) of the paper. Both matrices are
+    The equation A y = B u is equation (28) of the paper for all `samples` of an episode that
+    starts at rest: y has the outputs, degC, and u has the applied flows, t/h. Both matrices are
     sparse and have the shape (samples, samples).
     """
     A = scipy.sparse.eye_array(samples) - _lagged(model.alpha[:samples], 1)
@@ -85,27 +86,29 @@ def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
 def _lagged(coefficients: Array, lag: int) -> Any:
     """Return a sparse square matrix with coefficients[k, i] in row k, column k - lag - i.
 
-    `coefficients` has the shape (samples, order), and the matrix (samples, samples).
+    `coefficients` has the shape (samples, order), and the matrix has the shape (samples,
+    samples).
     """
     samples, order = coefficients.shape
-    # An element of a diagonal is placed by its column, so the transpose places it by its row.
+    # SciPy places the elements of diagonals by column. The transpose places them by row.
     diagonals = coefficients.T, lag + np.arange(order)
     return scipy.sparse.dia_array(diagonals, shape=(samples, samples)).T.tocsr()
 
 
 def response(A: Any, B: Any) -> Array:
-    """Return G, which solves A G = B: a flow of 1 t/h at sample j adds G[k, j] degC to y(k).
+    """Return the matrix G: a flow of 1 t/h at sample j adds G[k, j] degC to the output y(k).
 
-    `A` and `B` are the sparse matrices of `equations`. G has the shape (samples, samples).
+    G solves A G = B, where `A` and `B` are the sparse matrices of `equations`, and has the
+    shape (samples, samples).
     """
     return np.asarray(scipy.linalg.solve_triangular(A.toarray(), B.toarray(), lower=True))
 
 
 class Plan(NamedTuple):
-    """Mean flows of an episode, and the bounds of the mean errors that the flows cause."""
+    """The planned flows of an episode, and lower bounds of the mean errors with the flows."""
 
     errors: Array  # lower bounds of E|e(k)|, degC, shape (samples,)
-    flow: Array  # the mean of u_a(k), t/h, shape (samples,)
+    flow: Array  # mean of the applied flow u_a(k), t/h, shape (samples,)
 
 
 def plan(
@@ -117,63 +120,65 @@ def plan(
     quiet: bool = False,
     penalty: ArrayLike = 0.0,
 ) -> Plan:
-    """Return the mean flow for which the sum of the bounds of the errors is least.
+    """Return the flows for which the sum of the lower bounds of the mean errors is least.
 
-    The least sum is a lower bound for every controller, even for a controller that knows the
-    future. The proof uses y and u, the means of output and applied flow over all noise, loads
-    and random decisions of a controller:
+    The least sum is a lower bound of the sum of errors for every controller, even for a
+    controller that knows the future. In the proof, y and u are the means of output and applied
+    flow over all noise, loads and random decisions of a controller:
 
-    - Equation (28) of the paper is linear, so y and u satisfy equation (28) without noise.
-    - The flow always lies within the limits of the actuator, so u lies within the limits.
-    - The expected error is the set point minus y, and `bounds` gives a lower bound of the mean
-      absolute error for each expected error.
+    - Equation (28) of the paper is linear, so the means y and u satisfy equation (28) without
+      noise.
+    - The applied flow always lies within the limits of the actuator, so the mean flow u lies
+      within the limits.
+    - The expected error is the set point minus the mean output y, and `bounds` gives a lower
+      bound of the mean absolute error for each expected error.
 
-    So the controller's mean error is at least the minimum of the bounds over all u within the
-    limits. The minimum is a linear program, as each bound is a maximum of lines.
+    So the mean error of every controller is at least the minimum of the bounds over all mean
+    flows u within the limits. A linear program finds the minimum, as each bound is a maximum of
+    lines.
 
-    The bound is loose where the required flow lies inside the dead zone: the mean of the flows
-    0 and 5 t/h is 2.5 t/h, which no valve with a dead zone of 5 t/h passes. The bound is also
-    loose where the flow must alternate between the two sides of a limit.
+    The lower bound is loose where the required flow lies inside the dead zone: the mean of the
+    flows 0 and 5 t/h is 2.5 t/h, but a valve with a dead zone of 5 t/h cannot apply a flow of
+    2.5 t/h. The lower bound is also loose where the required flow lies now inside and now
+    outside the limits of the actuator.
 
     Parameters
     ----------
     model
-        The plant, for at least as many samples as `setpoint` has.
+        The plant at as many samples as `setpoint` has, or at more samples.
     bounds
-        The lower bounds of the mean absolute errors for this plant.
+        Lower bounds of the mean absolute errors for the plant `model`.
     setpoint
         Set points y_d(k), degC, shape (samples,).
     past
-        Flows at k = 0, 1, ... that are already decided, t/h, shape (decided,).
+        Flows at the samples k = 0, 1, ... that the plan must not change, t/h, shape (count,).
     quiet
-        Whether to prefer, among plans with equal errors, the plan that reaches the set point
-        with the least valve travel.
+        Whether to choose, among plans with equal errors, the plan with the least valve travel.
     penalty
-        The price of the flow u_a(k), degC for each t/h, of shape (samples,); or a number, the
-        price at all samples.
+        Price of the flow u_a(k), degC per t/h, shape (samples,), or one price for all samples.
 
     Raises
     ------
     RuntimeError
-        If no solver solves the linear program within `TIME_LIMIT`.
+        If no solver solves the linear program within `TIME_LIMIT` seconds.
     """
     samples = len(setpoint)
     flow = np.zeros(samples)
-    decided = np.size(past)
-    flow[:decided] = past
-    if decided < samples - 1:
+    past_count = np.size(past)
+    flow[:past_count] = past
+    if past_count < samples - 1:
         price = np.broadcast_to(np.asarray(penalty, float), samples)
-        program = _program(model, bounds, setpoint, flow, decided, quiet, price)
-        flow[decided:-1] = _solve(program, zeros=np.roots(model.parameters.b))
+        program = _program(model, bounds, setpoint, flow, past_count, quiet, price)
+        flow[past_count:-1] = _solve(program, zeros=np.roots(model.parameters.b))
     if samples > 1:
-        flow[-1] = flow[-2]  # The last flow affects no output; it costs nothing if it stays.
+        flow[-1] = flow[-2]  # The last flow affects no output, so the valve need not move.
     A, B = equations(model, samples)
     output = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
     return Plan(bounds.mean_error(setpoint - output), flow)
 
 
 class _Variables(NamedTuple):
-    """Variables of a linear program; each array has the shape (variables,)."""
+    """Costs and bounds of variables of a linear program, in arrays of shape (variables,)."""
 
     cost: Array  # cost of each unit of a variable
     low: Array  # lower bound of a variable
@@ -181,32 +186,35 @@ class _Variables(NamedTuple):
 
 
 def _variables(count: int, cost: Any, low: Any, high: Any) -> _Variables:
-    """Return `count` variables of a linear program, with numbers repeated for all variables.
+    """Return the costs and bounds of `count` variables of a linear program.
 
-    `cost`, `low` and `high` are arrays of shape (count,), or numbers.
+    `cost`, `low` and `high` are arrays of shape (count,), or numbers that apply to all
+    variables.
     """
     return _Variables(*(np.broadcast_to(values, count) for values in (cost, low, high)))
 
 
 class _Program(NamedTuple):
-    """The linear program of `plan` for the n flows that are not decided yet.
+    """The linear program of `plan` for the n flows that follow the past flows.
 
-    The outputs y and the flows u satisfy A y = B u. The expected error at k is the sum of
-    positive pieces minus the sum of negative pieces. There is a piece of each sign for every
-    slope of the bound. The first n targets are the set points minus the effects of past flows:
-    target k equals output k plus the expected error at k. A quiet plan, which limits valve
-    travel, has n more targets: target n + k equals flow k minus flow k - 1, minus the move up,
-    plus the move down. Target n is the last past flow, and the targets after n are 0.
+    The effects y of the n flows u on the outputs satisfy A y = B u. The program represents the
+    expected error at each sample as a sum of positive pieces minus a sum of negative pieces,
+    with one piece of each sign for every slope of the error bound. For k below n, `targets[k]`
+    is the set point minus the effect of past flows, degC, and equals the effect of the n flows
+    on output k plus the expected error at k. With the option `quiet` of `plan`, the program has
+    n more equations: `targets[n + k]` equals flow k minus flow k - 1, minus the upward move of
+    the valve, plus the downward move of the valve. `targets[n]` is the last past flow, t/h, and
+    the later targets are 0.
     """
 
     A: Any  # sparse matrix of the plant, shape (n, n)
     B: Any  # sparse matrix of the plant, shape (n, n)
-    targets: Array  # right sides, shape (n,), or (2 n,) in a quiet plan
-    outputs: _Variables  # the effects of the flows on the outputs, degC, n variables
-    flows: _Variables  # t/h, n variables
-    # Pieces of the expected errors, degC: for each slope, n positive and n negative pieces.
+    targets: Array  # right sides, shape (n,), or (2 n,) if `quiet` is true
+    outputs: _Variables  # effects of the n flows on the outputs, degC, n variables
+    flows: _Variables  # the n flows, t/h
+    # Pieces of the expected errors, degC: n positive and n negative pieces for each slope.
     pieces: _Variables
-    moves: _Variables  # t/h: n moves up and n moves down in a quiet plan, otherwise none
+    moves: _Variables  # t/h; n upward and n downward moves if `quiet` is true, else none
 
 
 def _program(
@@ -214,25 +222,18 @@ def _program(
     bounds: ErrorBounds,
     setpoint: Array,
     flow: Array,
-    decided: int,
+    past_count: int,
     quiet: bool,
     price: Array,
 ) -> _Program:
-    """Return the linear program of `plan`, whose solution has the flows that are not decided.
+    """Return the linear program of `plan` for the flows after the first `past_count` flows.
 
-    Parameters
-    ----------
-    model, bounds, setpoint, quiet
-        Arguments of `plan`.
-    flow
-        The flows that are decided, and 0 for all later flows, t/h, shape (samples,).
-    decided
-        The number of flows that are decided.
-    price
-        The price of each flow, degC for each t/h, shape (samples,).
+    `model`, `bounds`, `setpoint` and `quiet` are arguments of `plan`. `flow` has the past flows
+    and then zeros, t/h, shape (samples,). `price` has the price of each flow, degC per t/h,
+    shape (samples,).
     """
     samples = len(setpoint)
-    first = decided + 1  # the first output after the decided flows
+    first = past_count + 1  # sample of the first output after the past flows
     n = samples - first
     A, B = equations(model, samples)
     output_of_past = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
@@ -240,19 +241,20 @@ def _program(
     slopes = bounds.slopes
     moves = 0
     if quiet:
-        # A line may be level near an error of 0, where a quiet plan needs a slope.
+        # A line may have the slope 0 near an error of 0, but a quiet plan needs a slope above 0
+        # to end at the set point.
         slopes = np.maximum(slopes, SMALLEST_SLOPE)
-        last_flow = flow[decided - 1]  # 0 if no flow is decided
+        last_flow = flow[past_count - 1]  # 0 if there are no past flows
         targets = np.concatenate([targets, [last_flow], np.zeros(n - 1)])
         moves = 2 * n
-    # In the order of `_Program.pieces`.
+    # Upper bounds of the pieces, in the order of `_Program.pieces`.
     lengths = np.repeat(bounds.lengths[first:samples], 2, axis=1).T.ravel()
     return _Program(
         A=A[first:, first:],
-        B=B[first:, decided:-1],
+        B=B[first:, past_count:-1],
         targets=targets,
         outputs=_variables(n, 0.0, -np.inf, np.inf),
-        flows=_variables(n, price[decided:-1], *model.limits),
+        flows=_variables(n, price[past_count:-1], *model.limits),
         pieces=_variables(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
         moves=_variables(moves, TRAVEL_PRICE, 0.0, np.inf),
     )
@@ -261,22 +263,14 @@ def _program(
 def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
     """Return the flows of a linear program with the least cost, t/h, shape (n,).
 
-    Parameters
-    ----------
-    program
-        The linear program, with n flows.
-    zeros
-        The zeros of the polynomial B in equation (28) of the paper.
-
-    Raises
-    ------
-    RuntimeError
-        If no solver solves the program within `TIME_LIMIT`.
+    `zeros` has the zeros of the polynomial B in equation (28) of the paper. A RuntimeError is
+    raised if no solver solves `program` within `TIME_LIMIT` seconds.
     """
     n = len(program.flows.cost)
-    # With outputs among the variables the program is sparse, and fast where A is slow. But if
-    # a zero of B lies outside the unit circle, the flow that gives an output grows without
-    # bound: solvers that vary outputs freely fail, or end away from the optimum.
+    # With outputs among the variables, the linear program is sparse, so solvers are fast even
+    # if the plant is slow. But if a zero of B lies outside the unit circle, the flow that
+    # produces a given output grows without bound: solvers that choose outputs freely fail, or
+    # end away from the optimum.
     outputs_first = bool(np.all(np.abs(zeros) <= 1.0))
     for with_outputs in (outputs_first, not outputs_first):
         matrix, right = _equalities(program, with_outputs)
@@ -298,29 +292,30 @@ def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
                 flows: Array = solution.x[first_flow : first_flow + n]
                 return flows
     raise RuntimeError(
-        f"the linear program of {n} samples was not solved in any of {2 * len(SOLVERS)} ways: "
-        f"{solution.message}"
+        f"scipy.optimize.linprog did not solve the linear program with {n} flows in "
+        f"{2 * len(SOLVERS)} attempts: {solution.message}"
     )
 
 
 def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
-    """Return the equality constraints of a program: a matrix M and a vector r with M x = r.
+    """Return the equality constraints M x = r of a linear program: a sparse M and a vector r.
 
-    The vector x holds the flows, pieces and moves of `program`, after the outputs if
-    `with_outputs` is true. If `with_outputs` is false, the equations contain the effects of the
-    flows in place of the outputs. M is sparse.
+    The vector x has the outputs if `with_outputs` is true, and then the flows, pieces and moves
+    of `program`. If `with_outputs` is false, the equations contain the effects of the flows on
+    the outputs instead of the outputs.
     """
     n = len(program.flows.cost)
     rows = len(program.targets)
     eye = scipy.sparse.eye_array(n)
     differences = eye - scipy.sparse.eye_array(n, k=-1)  # flow k minus flow k - 1
     slopes = len(program.pieces.cost) // (2 * n)
-    # Columns of the matrix in the rows of the targets: outputs and pieces stand in the first n
-    # rows; flows and moves stand in the next n rows, which only a quiet plan has.
+    # Columns of the matrix M in the rows of the targets. The first n rows have the coefficients
+    # of the outputs and pieces. The next n rows, which only a quiet plan has, have the
+    # coefficients of the flows and moves.
     output_columns = scipy.sparse.eye_array(rows, n)
     flow_columns = scipy.sparse.eye_array(rows, n, k=-n, format="csr") @ differences
     piece_columns = scipy.sparse.hstack([eye, -eye] * slopes)
-    if rows > n:  # The columns of the moves follow those of the pieces.
+    if rows > n:  # The columns of the moves follow the columns of the pieces.
         move_columns = scipy.sparse.hstack([-eye, eye])
         piece_columns = scipy.sparse.block_diag([piece_columns, move_columns])
     if with_outputs:
@@ -339,26 +334,27 @@ def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
 def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
     """Return the plan of a controller that never expects another change of the set point.
 
-    At each change of the set point, the controller chooses the flow that is best if the new set
-    point stays for ever. If the plant has settled before each change, no controller that is
-    surprised by the changes has a smaller error. The reference is not a lower bound, since a
-    controller can have the times of all changes of a square wave built in.
+    At each change of the set point, the controller chooses the flows that are best if the set
+    point never changes again. If the plant has settled before each change, no controller that
+    does not expect the changes has a smaller error. The reference is not a lower bound for all
+    controllers, since a controller may know the times of the changes of a square wave in
+    advance.
 
     Parameters
     ----------
     model
-        The plant, for `model.lag + LOOKAHEAD` samples more than `setpoint` has.
+        The plant at `model.lag + LOOKAHEAD` samples more than `setpoint` has.
     bounds
-        The lower bounds of the mean absolute errors for this plant.
+        Lower bounds of the mean absolute errors for the plant `model`.
     setpoint
         Set points y_d(k), degC, shape (samples,).
 
     Raises
     ------
     NoBoundError
-        If the set point changes before the plant has settled.
+        If `setpoint` changes before the plant has settled.
     RuntimeError
-        If no solver solves a linear program within `TIME_LIMIT`.
+        If no solver solves a linear program within `TIME_LIMIT` seconds.
     """
     low, high = model.limits
     flow = np.zeros(0)
@@ -372,13 +368,13 @@ def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
         planned = plan(model, bounds, expected_setpoint, past=flow[:start], quiet=True)
         flow = planned.flow
         errors[start:stop] = planned.errors[start:stop]
-        # The range of the flows that affect outputs after the change, t/h.
+        # The range of the flows before the change that affect outputs after the change, t/h.
         flow_range = np.ptp(flow[max(stop - model.lag - 1, start - 1, 0) : stop])
         is_long = stop - start >= model.lag
         has_settled = is_long and flow_range <= SETTLED_FLOW_RANGE * (high - low)
         if not (is_last or has_settled):
             raise NoBoundError(
-                "setpoint must be held until the plant has settled, or there is no reference; "
-                f"got a hold of {stop - start} samples"
+                "setpoint must be held until the plant has settled for a reference to exist, "
+                f"got a set point that is held for {stop - start} samples"
             )
     return Plan(errors, flow)

@@ -1,7 +1,8 @@
-"""Compute how exactly the output of a plant can be predicted from the transmitter's readings.
+"""Compute the variance of the best prediction of a plant's output from noisy readings.
 
-The Kalman filter gives the covariance of the state of a plant, given the readings so far, and
-from this covariance follows the variance of the best prediction.
+A Kalman filter gives the covariance of the plant's state, given the transmitter's readings up
+to a sample. The covariance of the state determines the variance of the best prediction of the
+output.
 """
 
 import numpy as np
@@ -11,16 +12,16 @@ from benchmarks.loop.linear import LinearModel
 
 Array = NDArray[np.float64]
 
-# Variance of the readings of a perfect transmitter, degC^2; 0 would divide by 0 in the filter.
+# Least variance of readings in the Kalman filter, degC^2, to avoid a division by 0.
 SMALLEST_VARIANCE = 1e-8
 
 
 def noise_variance(model: LinearModel) -> Array:
-    """Return the variance of the error with which an output y(k) without load is predicted.
+    """Return the variances of the errors of the best predictions, degC^2, shape (samples,).
 
-    The output y(k) is predicted as well as possible from the transmitter's readings up to
-    k - d - 1, where d is the plant's delay. The variances are in degC^2, shape (samples,), for
-    the samples k of `model`.
+    The best prediction of the output y(k) uses the transmitter's readings up to k - d - 1,
+    where d is the plant's delay in samples. `model` is a plant with noise and without load at
+    the samples k = 0, 1, ... of an episode.
     """
     F, Q = noise_system(model)
     return predicted_variance(noise_covariance(model), F, Q, model.lag)
@@ -29,8 +30,8 @@ def noise_variance(model: LinearModel) -> Array:
 def noise_covariance(model: LinearModel) -> Array:
     """Return the covariances of the state x(k) of a plant without load, given readings up to k.
 
-    `noise_system` describes the state. The covariances are 0 if the transmitter is perfect. The
-    covariances have the shape (samples, size, size), for the samples k of `model`.
+    `noise_system` describes the state. The covariances have the shape (samples, size, size),
+    where size is the length of the state, and are 0 if the transmitter has no noise.
     """
     F, Q = noise_system(model)
     if model.numbers.measurement_noise_variance == 0.0:
@@ -39,11 +40,12 @@ def noise_covariance(model: LinearModel) -> Array:
 
 
 def noise_system(model: LinearModel) -> tuple[Array, Array]:
-    """Return F(k) and Q(k) of x(k) = F(k) x(k-1) + v(k), the effect of noise on a plant.
+    """Return F(k) and Q(k) of the state equation of a plant with noise and without load.
 
-    The state x(k) is the state of `LinearModel.state_space`, whose first element is the output
-    y(k), degC. The vector v(k) is white with the covariance Q(k). F and Q have the shape
-    (samples, size, size), for the samples k of `model`.
+    The state equation is x(k) = F(k) x(k-1) + v(k), where x(k) is the state of
+    `LinearModel.state_space`, whose first element is the output y(k), degC, and v(k) is white
+    noise with the covariance matrix Q(k). F and Q have the shape (samples, size, size), where
+    size is the length of x(k).
     """
     F, g = model.state_space()
     covariance = model.numbers.noise_variance * np.outer(g, g)
@@ -56,8 +58,8 @@ def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
     Parameters
     ----------
     F, Q
-        Matrices of x(k) = F(k) x(k-1) + v(k), shape (samples, size, size), where x(0) = 0 and
-        v(k) is white with the covariance Q(k).
+        Matrices of the state equation x(k) = F(k) x(k-1) + v(k), shape (samples, size, size),
+        where x(0) = 0 and v(k) is white noise with the covariance matrix Q(k).
     reading_variance
         Variance of the white noise in a reading of the first element of x(k), degC^2.
 
@@ -84,20 +86,22 @@ def predicted_variance(filtered: Array, F: Array, Q: Array, lag: int) -> Array:
     filtered
         Covariances of the state x(k), given the readings up to k, shape (samples, size, size).
     F, Q
-        Matrices of x(k) = F(k) x(k-1) + v(k), shape (samples, size, size), where v(k) is white
-        with the covariance Q(k). The first element of x(k) is y(k).
+        Matrices of the state equation x(k) = F(k) x(k-1) + v(k), shape (samples, size, size),
+        where the first element of x(k) is y(k), and v(k) is white noise with the covariance
+        matrix Q(k).
     lag
         Number of samples to predict ahead.
 
     Returns
     -------
     ndarray
-        Variances of y(k), shape (samples,). For k below `lag`, y(k) is predicted from x(0),
-        which is known.
+        Variances of y(k), degC^2, shape (samples,). For k below `lag`, y(k) is predicted from
+        the state x(0), which is known.
     """
     samples = len(F)
     steps = min(lag, samples)
-    # The predictions of all outputs y(k) advance together, from `sample` = k - lag to k.
+    # Predictions of the outputs y(k) at all samples k advance together, from `sample` = k - lag
+    # to k.
     sample = np.arange(samples) - steps
     P = filtered[np.maximum(sample, 0)]
     for _ in range(steps):
@@ -106,5 +110,5 @@ def predicted_variance(filtered: Array, F: Array, Q: Array, lag: int) -> Array:
         advanced = F[from_start] @ P @ F[from_start].transpose(0, 2, 1) + Q[from_start]
         has_begun = sample >= 1
         P = np.where(has_begun[:, np.newaxis, np.newaxis], advanced, P)
-    # Rounding can leave a variance of 0 a little below it.
+    # Rounding errors can make a variance of 0 negative.
     return np.maximum(P[:, 0, 0], 0.0)

@@ -2,45 +2,50 @@
 
 The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k), with
 the output y, the flow u_a, the delay d and the white noise xi. A load w(k) adds A(1) w(k) to
-the right side. The load is the sum of a random walk and of a piecewise constant part, whose
-changes are called *jumps*.
+the right side of equation (28). The load is the sum of a random walk and of a piecewise
+constant part, whose changes are called *jumps*.
 
 A flow at sample j affects the output y(j + d + 1) at the earliest. So no flow counteracts the
-effects on y(k) of noise, walk and jumps after the sample k - d - 1. Let n(k) be the sum of the
-effects that no flow counteracts, degC, and m(k) the error if n(k) were 0. The error is
+effects on y(k) of noise, random walk and jumps after the sample k - d - 1. Let n(k) be the sum
+of the effects on y(k) that no flow counteracts, degC, and let m(k) be the error at sample k if
+n(k) were 0. The error is
 
     e(k) = m(k) - n(k).
 
-The number m(k) is known at k - d - 1, and n(k) has the mean 0, so E[e] = E[m]. The linear
-program in `linear_program.py` needs a lower bound of E|e| that is a convex, piecewise linear
-function of E[e]. Let K be everything that is known at k - d - 1. For every slope s,
+The number m(k) is known at sample k - d - 1, and the random number n(k) has the mean 0, so E[e]
+= E[m]. The linear program in `linear_program.py` needs a lower bound of E|e| that is a convex,
+piecewise linear function of the expected error E[e]. Let K be everything that a controller
+knows at sample k - d - 1. For every slope s from -1 to 1,
 
     E[|m - n| given K] >= s m + min over x of E[|x - n| - s x given K].
 
-The mean of this inequality over K is a line in E[e],
+The mean of this inequality over K is a lower bound of E|e| that is a line in E[e],
 
-    E|e| >= s E[e] + a(s),
+    E|e| >= s E[e] + a(s).
 
-where the intercept a(s) is the mean of the minima over x. Three steps lead to a number below
-a(s) that can be computed:
+The intercept a(s) is the mean over K of the minimum over x of E[|x - n| - s x given K]. Three
+steps lead to a computable lower bound of the intercept a(s):
 
-1. K is taken to contain more than any controller knows: the walk and the piecewise constant
-   part of the load up to k - d - 1. K does not contain the times of later jumps, so the minimum
-   is over a single x for all times of jumps. If the transmitter is noisy, K does not contain
-   the true output. For a known load, output and readings are jointly normal, so the noise in n
-   has the variance of the best prediction of the output from the readings (Kalman filter).
-2. Given K, the distribution of n depends only on the level l of the piecewise constant part at
-   k - d - 1. The first jump replaces l by a new level. So n is the product of l and a random
-   factor, plus a random number that does not depend on l. Therefore |x - n| - s x is convex in
-   x and l together, and the minimum over x is a convex function of l. The mean of a convex
-   function over a slice of levels is at least the value of the function at the mean level of
-   the slice (Jensen's inequality).
-3. Each normal or uniform distribution is replaced by atoms, the means of equally probable
-   slices. In a sum of distributions, neighbouring atoms are replaced by their mean. Replacing
-   random numbers by their mean never makes the mean of |x - n| larger (Jensen's inequality).
+1. K is assumed to contain more than any controller knows: the random walk and the piecewise
+   constant part of the load up to sample k - d - 1. K does not contain the times of jumps after
+   sample k - d - 1, so a single x applies to all possible times of these jumps. If the
+   transmitter is noisy, K contains the transmitter's readings, but not the true output. For a
+   known load, the output and the readings are jointly normal, so the noise in n(k) has the
+   variance of the error of the best prediction of the output from the readings (Kalman filter).
+2. Given K, the distribution of n(k) depends only on the level l, which is the piecewise
+   constant part of the load at sample k - d - 1. The first jump after sample k - d - 1 replaces
+   the level l by a new level. So n(k) is the product of the level l and a random factor, plus a
+   random number that does not depend on l. Therefore |x - n(k)| - s x is convex in x and l
+   together, and the minimum over x of the mean of |x - n(k)| - s x is a convex function of l.
+   The mean of a convex function over a slice of levels is at least the value of the function at
+   the mean level of the slice (Jensen's inequality).
+3. Each normal or uniform distribution is replaced by the means of equally probable slices of
+   the distribution. In the distribution of a sum of random numbers, groups of neighbouring
+   values are replaced by their means. Replacing values of n(k) by their mean never makes the
+   mean of |x - n(k)| larger (Jensen's inequality).
 
-After step 3, n has finitely many values, and the minimum over x is at one of these values, a
-quantile.
+After step 3, n(k) has finitely many values, and the minimum over x is at one of these values, a
+quantile of n(k).
 """
 
 import math
@@ -66,28 +71,29 @@ from mptc_gym.plant.signals import LOAD_INTERVAL
 
 Array = NDArray[np.float64]
 
-# Numbers of atoms that represent distributions. With more atoms, the bounds of the
-# environment's presets would change by at most 0.0002 degC.
-NOISE_ATOMS = 128  # of the sum of the effects of the noise xi and of the load's walk
-WALK_ATOMS = 4  # of each step of the load's walk
-JUMP_ATOMS = 32  # of the effect of a jump and of later jumps, and of noise in their sum
-JUMP_LEVEL_ATOMS = 8  # of the new level of the load after a jump
-KNOWN_LEVEL_ATOMS = 8  # of the load's level that is known at k - d - 1; an even number
-# Slopes s of the lines that bound the mean error. The slopes are closer together near 1, as the
-# mean error approaches the magnitude of the expected error slowly.
+# Numbers of atoms, which are the values of discrete distributions. With more atoms, the bounds
+# of the environment's presets would change by at most 0.0002 degC.
+NOISE_ATOMS = 128  # for the effects of the noise xi and of the load's walk
+WALK_ATOMS = 4  # for each step of the load's walk
+JUMP_ATOMS = 32  # for the effect of a jump and all later jumps
+JUMP_LEVEL_ATOMS = 8  # for the new level of the load after a jump
+KNOWN_LEVEL_ATOMS = 8  # for the load's level at sample k - d - 1; an even number
+# Slopes s of the lines that bound the mean error. The slopes are closer together near 1, since
+# the mean error approaches the magnitude of the expected error slowly.
 SLOPES = 1.0 - np.array([64, 53, 42, 31, 22, 14, 8, 4, 1, 0]) / 64.0
 
 
 def error_bounds(model: LinearModel) -> ErrorBounds:
     """Return the lower bounds of the mean errors that noise and load cause, for each sample.
 
-    No flow can counteract the effects of noise and load in the last d + 1 samples, where d is
-    the plant's delay; see the description of the module. The load is taken to be known.
+    The description of the module derives the lower bounds, which assume that the controller
+    knows the load up to sample k - d - 1, where d is the plant's delay. No flow can counteract
+    the effects of noise and load in the last d + 1 samples.
 
     Parameters
     ----------
     model
-        One plant, for the samples k = 0, 1, ... of an episode.
+        One plant at the samples k = 0, 1, ... of an episode.
     """
     numbers = model.numbers
     # The steps of the load's walk are uniformly distributed between -largest_step and
@@ -113,8 +119,9 @@ def error_bounds(model: LinearModel) -> ErrorBounds:
 def bounds_for_normal(variance: Array) -> ErrorBounds:
     """Return the lower bounds of the mean errors if the inevitable errors are normal.
 
-    `variance` holds the variance of the inevitable error, which no flow can counteract in time,
-    degC^2, for each sample, shape (samples,). The inevitable error has the mean 0.
+    The inevitable error is the part of the error that no flow can counteract in time. The
+    inevitable error has the mean 0 and, at each sample, the variance `variance`, degC^2, shape
+    (samples,).
     """
     if not variance.any():
         return ErrorBounds(np.ones(1), np.zeros((len(variance), 1)))
@@ -123,32 +130,34 @@ def bounds_for_normal(variance: Array) -> ErrorBounds:
 
 
 class LoadChanges(NamedTuple):
-    """For each sample k, the changes of the load that are not yet known at k - d - 1.
+    """The changes of the load that no controller knows when its flow can still affect y(k).
 
-    Here d is the delay of the plant, samples. The load can change at every multiple of
-    `LOAD_INTERVAL` above 0. The changes at the samples from k - d to k are unknown.
+    The flow at sample k - d - 1 is the last flow that can affect the output y(k), where d is
+    the plant's delay in samples. The changes of the load at the samples from k - d to k are
+    unknown to a controller at sample k - d - 1. The load can change at every sample k above 0
+    that is a multiple of `LOAD_INTERVAL`.
     """
 
-    # Change of y(k), degC, for a change of the load by 1 degC, by the place of the change: the
-    # latest unknown change comes first. The effect is 0 where there are fewer changes. Shape
-    # (samples, largest number of unknown changes).
+    # Effect on y(k), degC, of an unknown change of the load by 1 degC, in the order from the
+    # latest change to the earliest change. The effect is 0 if sample k has fewer unknown
+    # changes. Shape (samples, largest number of unknown changes).
     effects: Array
-    counts: NDArray[np.intp]  # the number of unknown changes, shape (samples,)
-    known_counts: NDArray[np.intp]  # the number of changes up to k - d - 1, shape (samples,)
+    counts: NDArray[np.intp]  # number of unknown changes, shape (samples,)
+    known_counts: NDArray[np.intp]  # number of changes up to k - d - 1, shape (samples,)
 
 
 def load_changes(model: LinearModel) -> LoadChanges:
     """Return the changes of the load that no flow can counteract in time, for each sample.
 
-    `model` is a plant, for the samples k = 0, 1, ... of an episode.
+    `model` is one plant at the samples k = 0, 1, ... of an episode.
     """
-    samples = len(model.load)
+    samples = len(model.load_factor)
     k = np.arange(samples)
     times = np.arange(0, samples, LOAD_INTERVAL)
-    ages = k[:, np.newaxis] - times  # samples from each time to k
+    ages = k[:, np.newaxis] - times  # number of samples from each of `times` to k
     # Row k, column i: the effect on y(k), degC, of a change of the load by 1 degC at times[i].
     # The load does not change at the first time, k = 0.
-    steps = model.load[:, np.newaxis] * (ages >= 0) * (times > 0)
+    steps = model.load_factor[:, np.newaxis] * (ages >= 0) * (times > 0)
     A, _ = equations(model, samples)
     responses = scipy.sparse.linalg.spsolve_triangular(A, steps)
     responses[ages >= model.lag] = 0.0  # A flow counteracts these changes in time.
@@ -166,30 +175,26 @@ def _after_jumps(
 ) -> list[Distribution]:
     """Return the distributions of the effect on y(k) of a jump of the load and all later jumps.
 
-    The load keeps a new level until the next jump replaces the level by another level. The
-    effect of the level before the first jump is left out.
+    Item i of the list is the distribution if the first jump is at the change of the load in
+    column i of `effects`. The load keeps a new level until the next jump. The returned
+    distributions leave out the effect of the load's level before the first jump.
 
     Parameters
     ----------
     effects
-        Change of y(k), degC, for a change of the load by 1 degC, shape (samples, changes), the
-        latest change first.
+        Effect on y(k), degC, of a change of the load by 1 degC, shape (samples, changes), with
+        the latest change in column 0.
     amplitude
-        New levels of the load are uniformly distributed within +-`amplitude`, degC.
+        Largest magnitude of a new level of the load, degC; levels are uniformly distributed.
     jump_probability
-        The probability that the load jumps at one of the samples at which it can change.
-
-    Returns
-    -------
-    list of Distribution
-        Item i is the distribution if the first jump is at the change in column i of `effects`.
+        Probability that the load jumps at a sample that is a multiple of `LOAD_INTERVAL`.
     """
     samples, changes = effects.shape
     no_jump_probability = 1.0 - jump_probability
     distributions: list[Distribution] = []
     for place in range(changes):
         effect = effects[:, place]
-        # There is no later jump, or the next jump is at one of the later changes.
+        # Either no jump follows, or the next jump is at one of the later changes.
         parts = [uniform(amplitude * effect, JUMP_ATOMS)]
         probabilities = [np.full(samples, no_jump_probability**place)]
         for next_jump in range(place):
@@ -207,18 +212,19 @@ def _effects_on_output(
 ) -> tuple[Distribution, Array]:
     """Return the distribution of n(k), the effect on y(k) that no flow can counteract in time.
 
-    The distribution depends on l, the level of the load at k - d - 1, degC, where d is the
-    plant's delay. `_intercepts_with_jumps` describes the parameters.
+    The distribution of n(k) depends on l, the level of the load at sample k - d - 1, degC,
+    where d is the plant's delay. `_intercepts_with_jumps` describes the parameters.
 
     Returns
     -------
     at_level_0 : Distribution
-        The distribution of n(k) if l is 0.
+        Distribution of n(k) if the level l of the load is 0 degC.
     effect_of_level : Array
-        The change of each value of `at_level_0` by each degC of l, shape (samples, atoms).
+        Change of each value of `at_level_0` per degC of the level l, shape (samples, atoms).
     """
     no_jump_probability = 1.0 - jump_probability
-    # The load does not jump after k - d - 1, or one of the unknown changes is the first jump.
+    # Either the load does not jump after sample k - d - 1, or the first jump is at one of the
+    # unknown changes.
     parts = [noise]
     probabilities: list[Array] = [no_jump_probability ** changes.counts.astype(np.float64)]
     effects_of_level = [np.zeros_like(noise.values)]
@@ -238,26 +244,16 @@ def _effects_on_output(
 def _intercepts_with_jumps(
     changes: LoadChanges, noise: Distribution, amplitude: float, jump_probability: float
 ) -> Array:
-    """Return the intercepts a(s) of the bounds of the mean errors for a load with jumps.
+    """Return the intercepts a(s) for a load with jumps, degC, shape (samples, slopes).
 
-    The intercepts are means over the level of the load at k - d - 1, where d is the plant's
-    delay. The level is 0 until the first jump of the episode, and then uniformly distributed.
+    The description of the module defines the intercept a(s) for each slope s in `SLOPES`. The
+    intercepts are means over the level of the load at sample k - d - 1, where d is the plant's
+    delay. The level of the load is 0 until the first jump of the episode, and then uniformly
+    distributed from -`amplitude` to `amplitude`, degC. The load jumps with the probability
+    `jump_probability` at each sample at which the load can change.
 
-    Parameters
-    ----------
-    changes
-        The changes of the load that are unknown at k - d - 1.
-    noise
-        Distribution of the effect of the noise xi and of the load's walk on y(k), degC.
-    amplitude
-        Levels of the load are uniformly distributed within +-`amplitude`, degC.
-    jump_probability
-        The probability that the load jumps at one of the samples at which it can change.
-
-    Returns
-    -------
-    ndarray
-        The intercepts for `SLOPES`, degC, shape (samples, slopes).
+    `changes` has the changes of the load that are unknown at sample k - d - 1, and `noise` is
+    the distribution of the effect on y(k) of the noise xi and of the load's random walk, degC.
     """
     at_level_0, effect_of_level = _effects_on_output(
         changes, noise, amplitude, jump_probability
@@ -267,7 +263,7 @@ def _intercepts_with_jumps(
     both_signs = np.append(SLOPES, -SLOPES)
     half = KNOWN_LEVEL_ATOMS // 2
     levels = [0.0, *(amplitude * (np.arange(half) + 0.5) / half)]
-    never_jumped = (1.0 - jump_probability) ** changes.known_counts  # probability
+    never_jumped = (1.0 - jump_probability) ** changes.known_counts  # a probability
     probabilities = [never_jumped] + [(1.0 - never_jumped) / half] * half
     intercepts = np.zeros((len(changes.counts), len(SLOPES)))
     for level, probability in zip(levels, probabilities, strict=True):

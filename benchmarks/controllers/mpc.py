@@ -1,8 +1,8 @@
 """Control the plant by model predictive control (MPC), with an exact model of the plant.
 
-The controller knows all parameters of the plant, the noise and the load, but neither future
-noise and loads nor future set points. The mean error of the controller shows how close to the
-bounds of `benchmarks.bounds` an error can be.
+The controller knows all parameters of the plant, the noise and the load, but neither the future
+noise and load nor future set points. The mean error of model predictive control shows how close
+to the lower bounds of `benchmarks.bounds` an error can be.
 """
 
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ from mptc_gym.plant.signals import LOAD_INTERVAL, SetPointLevels
 
 Array = NDArray[np.float64]
 
-HORIZON = 5  # flows in a plan, one a sample; the first flow is applied, then all are replanned
-MOST_SWEEPS = 100  # of coordinate descent, to bound the time of a sample
+HORIZON = 5  # number of flows in a plan, one for each sample
+MOST_SWEEPS = 100  # largest number of sweeps of coordinate descent per sample
 TOLERANCE = 1e-4  # t/h; coordinate descent stops if a sweep changes no flow by this much
-SMALL_VARIANCE = 1e-9  # degC^2; added to the variance of the noise, so that it is above 0
+SMALL_VARIANCE = 1e-9  # degC^2; added to the noise variance, which may be 0
 SMALL_DEVIATION = 1e-9  # degC; least standard deviation of a forecast error, in place of 0
 SMALLEST_CURVATURE = np.finfo(np.float64).tiny  # degC^2 per (t/h)^2; a divisor in place of 0
-WARM_UP = 200  # samples until the covariance of the Kalman filter hardly changes
+WARM_UP = 200  # number of samples after which the Kalman filter's covariance hardly changes
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,17 @@ class _Model:
     Attributes
     ----------
     plants : LinearModel
-        The plants of all runs.
+        Plants of all runs.
     response : Array
-        The matrix G, shape (n, HORIZON, HORIZON), degC per t/h. G times the planned flows is
-        the effect of the flows on the first HORIZON outputs that the flows can affect.
+        Matrix G of each run, degC per t/h, shape (n, HORIZON, HORIZON). G times the planned
+        flows is the effect of the planned flows on the first HORIZON outputs that the planned
+        flows can affect.
     hessian : Array
-        The transpose of G times G, shape (HORIZON, HORIZON, n). The axis of the runs is last,
-        because operations on all runs are faster in this order.
+        Transpose of G times G, (degC per t/h)^2, shape (HORIZON, HORIZON, n). The axis of the
+        runs is last, because NumPy operations on all runs are faster in this order.
     curvature : Array
-        The second derivative of the cost by each planned flow, shape (HORIZON, n). A flow that
-        affects no output within the horizon has the curvature `SMALLEST_CURVATURE`, not 0.
+        Second derivative of the cost of a plan by each planned flow, shape (HORIZON, n). If a
+        flow affects no output within the horizon, the curvature is `SMALLEST_CURVATURE`, not 0.
     """
 
     plants: LinearModel
@@ -55,7 +56,7 @@ class _Model:
 
     @classmethod
     def of(cls, plants: LinearModel) -> "_Model":
-        """Return the model of n plants at one sample."""
+        """Return the model of the plants of n runs at one sample."""
         impulse_response = plants.impulse_response(HORIZON)
         response = np.zeros((len(impulse_response), HORIZON, HORIZON))
         for j in range(HORIZON):  # Flow j affects the outputs from output j on.
@@ -77,8 +78,8 @@ class _Model:
         plan
             The planned flows, t/h, shape (HORIZON, n).
         slopes
-            How fast the cost falls with each planned flow if all planned flows are 0, degC^2
-            per t/h, shape (HORIZON, n).
+            Negative derivative of the cost by each planned flow, at a plan of zeros, degC^2 per
+            t/h, shape (HORIZON, n).
         """
         quadratic = np.einsum("in,ijn,jn->n", plan, self.hessian, plan) / 2.0
         return np.asarray(quadratic - (slopes * plan).sum(axis=0))
@@ -87,22 +88,24 @@ class _Model:
 class PredictiveController:
     """Plan, at each sample, the flows that bring the expected output to the set point.
 
-    The controller knows the polynomials A, B and C and the delay d of the plant, equation (28)
-    of the paper, and how A and B drift, even if the plant is random and differs from run to
-    run. A Kalman filter estimates the output, the white noise xi and the load from the
-    transmitter's readings. The load jumps and is not normally distributed, so the Kalman filter
-    is the best linear filter, but not the best filter.
+    The controller knows the polynomials A, B and C and the delay d of each run's plant,
+    equation (28) of the paper, and how A and B drift, even if the environment draws the plants
+    at random. A Kalman filter estimates the output, the white noise xi and the load from the
+    transmitter's readings. Since the load jumps and is not normally distributed, the Kalman
+    filter is the best linear filter, but not the best of all filters.
 
     The mean absolute error is least if the median of the output is at the set point. So the
-    expected outputs are medians, and the load is expected to stay as it is. The planned flows
-    lie within the limits of the actuator, and minimise the sum of squared differences between
-    expected outputs and target outputs. The sum has HORIZON outputs, from the first output on
-    that the planned flows can affect. If the first planned flow lies inside the dead zone, the
-    flow becomes 0 or the flow at the edge of the dead zone, whichever gives the smaller sum.
+    controller forecasts medians of the outputs, and assumes that the load does not change. The
+    planned flows lie within the limits of the actuator, and minimise the sum of squared
+    differences between forecast outputs and target outputs. The sum of squared differences has
+    HORIZON terms, beginning with the first output that the planned flows can affect. If the
+    first planned flow lies inside the dead zone, the controller replaces the flow by 0 or by
+    the flow at the edge of the dead zone, whichever gives the smaller sum of squared
+    differences.
 
     If set points are not random, the target outputs are equal to the present set point. If set
-    points are random, the controller computes from the time since the latest change how likely
-    a change within the delay is, and `agents.hedge` chooses the target outputs.
+    points are random, `agents.hedge` computes the target outputs from the probability that the
+    set point changes within the plant's delay, given the time since the latest change.
 
     Parameters
     ----------
@@ -111,36 +114,42 @@ class PredictiveController:
     num_envs : int
         Number of runs in the batch.
     seed : int
-        Seed of the first run: the controller knows the plant numbers that the environment draws
-        for run i with the seed `seed + i`.
+        Seed of the first run. The controller of run i knows the plant that the environment
+        draws with the seed `seed + i`.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int, seed: int = 0) -> None:
         self._parameters = parameters
         self._num_envs = num_envs
+        # Parameter values of the plant of each run: arrays of shape (runs,).
         self._numbers = drawn_numbers(parameters, num_envs, seed)
         self._delay = self._numbers.delay.astype(np.intp)
         self._longest_delay = int(self._delay.max())
-        # At each sample at which the load may step, it steps with the probability p. A load of
-        # x degC then becomes (1 - p) x in the mean; the variance of the load stays the same.
-        step_probability = np.minimum(LOAD_INTERVAL / self._numbers.disturbance_interval, 1.0)
-        self._load_stays = 1.0 - step_probability
-        # The variance of a level that is uniformly distributed within the amplitude.
+        # At every multiple of LOAD_INTERVAL samples, the piecewise constant part of the load
+        # jumps with the probability p to a random level with the mean 0, so a level of x degC
+        # becomes (1 - p) x in the mean. A random change with the variance `jump_variance` keeps
+        # the variance of the level constant.
+        jump_probability = np.minimum(LOAD_INTERVAL / self._numbers.disturbance_interval, 1.0)
+        self._no_jump_probability = 1.0 - jump_probability
+        # Variance of a uniform distribution from -amplitude to amplitude, degC^2.
         level_variance = np.square(self._numbers.disturbance_amplitude) / 3.0
-        step_variance = level_variance * (1.0 - np.square(self._load_stays))
+        jump_variance = level_variance * (1.0 - np.square(self._no_jump_probability))
         walk_variance = LOAD_INTERVAL * self._numbers.disturbance_walk_variance
         noise_variance = self._numbers.noise_variance + SMALL_VARIANCE
         # The variances of v(k) in `LinearModel.state_space_with_load`, degC^2, shape (runs, 3).
-        self._variances = np.stack([noise_variance, step_variance, walk_variance], axis=1)
-        # Flow i of a plan affects the output y(k + 1 + delay + i) at the earliest. Here are the
-        # columns of these outputs in the outputs of `_predict`, shape (runs, HORIZON).
+        self._variances = np.stack([noise_variance, jump_variance, walk_variance], axis=1)
+        # Flow i of a plan affects the output y(k + 1 + delay + i) at the earliest. This output
+        # is in column delay + i of the result of `_predict`, since column 0 is y(k + 1). Shape
+        # (runs, HORIZON).
         self._reached_columns = self._delay[:, np.newaxis] + np.arange(HORIZON, dtype=np.intp)
-        # Coefficient i of B multiplies u_a(k + ahead - d - 1 - i) in the output y(k + ahead).
-        # Here is the column of this flow in `_flows`, shape (runs, outputs, coefficients).
+        # Coefficient i of B multiplies the flow u_a(k + ahead - d - 1 - i) in the equation of
+        # y(k + ahead). In `_flows`, whose column j is u_a(k - j), this flow is in column d + 1
+        # + i - ahead. Column 0, which is always 0, stands for all flows from sample k on. Shape
+        # (runs, outputs, coefficients of B).
         ahead = np.arange(self._longest_delay + HORIZON + 1)[:, np.newaxis]
         samples_back = self._delay[:, np.newaxis, np.newaxis] + 1 + np.arange(len(parameters.b))
         self._flow_columns = np.maximum(samples_back - ahead, 0)
-        self._models: dict[int, _Model] = {}  # by the sample from which the coefficients hold
+        self._models: dict[int, _Model] = {}  # by first sample of a model
         self._random: RandomSetpoint | None = None
         levels = SetPointLevels(parameters)
         if levels.random and levels.amplitude > 0.0:
@@ -150,26 +159,26 @@ class PredictiveController:
         self.reset()
 
     def reset(self) -> None:
-        """Prepare for a new episode: forget all readings and flows, as the plant is at rest."""
+        """Prepare for a new episode, which begins at rest: forget all readings and flows."""
         runs = self._num_envs
         order = self._model(0).plants.outputs_in_state
         size = order + len(self._parameters.c) - 1 + 2  # with the two parts of the load
         self._k = 0
-        # The state of the plants, as `LinearModel.state_space_with_load` describes it.
+        # The state of the plants, which `LinearModel.state_space_with_load` describes.
         self._state = np.zeros((runs, size))
         self._covariance = np.zeros((runs, size, size))
-        # Column j has the flow u_a(k - j), t/h. Column 0 stays 0: `_predict` takes the flows
-        # from the present sample on to be 0.
+        # Column j is the flow u_a(k - j), t/h. Column 0 is always 0, since `_predict` assumes
+        # that the flows from the present sample k on are 0.
         self._flows = np.zeros((runs, 1 + self._longest_delay + len(self._parameters.b)))
         self._plan = np.zeros((HORIZON, runs))
         self._setpoint = np.full(runs, np.nan)  # the latest set point, degC
-        self._age = np.zeros(runs, np.intp)  # samples since the set point changed
+        self._age = np.zeros(runs, np.intp)  # number of samples since the set point changed
 
     def act(self, observation: Array) -> NDArray[np.float32]:
-        """Return the actions of a sample, from -1 to 1, shape (runs, 1).
+        """Return the actions of one sample, from -1 to 1, shape (runs, 1).
 
         `observation` has the observations of the environment, shape (runs, elements): the
-        latest set points, degC, newest first, and then the latest errors, degC.
+        latest set points, degC, newest first, and then the latest errors, degC, newest first.
         """
         observation = np.asarray(observation, dtype=np.float64)
         setpoint = observation[:, 0]
@@ -180,7 +189,8 @@ class PredictiveController:
         free_outputs = np.take_along_axis(self._predict(), self._reached_columns, axis=1)
         differences = self._targets(setpoint) - free_outputs
         slopes = np.ascontiguousarray(np.einsum("ni,nij->nj", differences, model.response).T)
-        # The last plan, a sample later, with the last flow held.
+        # The search starts at the plan of the previous sample, shifted by a sample, with the
+        # last flow repeated.
         start = np.vstack([self._plan[1:], self._plan[-1:]])
         plan = self._optimise(model, slopes, start)
         self._plan, command = self._avoid_dead_zone(model, slopes, plan)
@@ -192,11 +202,12 @@ class PredictiveController:
         return action[:, np.newaxis]
 
     def _targets(self, setpoint: Array) -> Array:
-        """Return the target outputs, degC, shape (runs, HORIZON), and note the set points.
+        """Return the target outputs, degC, shape (runs, HORIZON), and store the set points.
 
         Column i has the target of the first output that the planned flow i can affect.
-        `setpoint` has the present set points, degC, shape (runs,). The method must be called
-        once a sample.
+        `setpoint` has the present set points, degC, shape (runs,). `_targets` must be called
+        once a sample, since the method counts the samples since the latest change of the set
+        point.
         """
         if self._random is None:
             return np.broadcast_to(setpoint[:, np.newaxis], (len(setpoint), HORIZON))
@@ -212,8 +223,8 @@ class PredictiveController:
         """Return the standard deviation of the forecast error of each run, degC, shape (runs,).
 
         The forecast is the expected value of the first output that the next flow can affect.
-        The method leaves the Kalman filter in the state that it has after many samples of a
-        plant that does not drift.
+        For the result, the Kalman filter is brought to its steady state, with a plant that does
+        not drift.
         """
         self.reset()
         plants = self._model(0).plants
@@ -230,7 +241,7 @@ class PredictiveController:
     def _filter(self, reading: Array) -> None:
         """Advance the state and the covariance of the Kalman filter from sample k - 1 to k.
 
-        `reading` has the transmitter's readings at the present sample k, degC, shape (runs,).
+        `reading` has the transmitter's readings at sample k, degC, shape (runs,).
         """
         plants = self._model(self._k).plants
         F, Q = self._transition(self._k, plants)
@@ -243,9 +254,9 @@ class PredictiveController:
     def _update_covariance(self, F: Array, Q: Array) -> Array:
         """Advance the Kalman filter's covariance by a sample, and return the filter's gain.
 
-        The state transition matrices F and the covariances Q of the process noise have the
-        shape (runs, size, size), where size is the length of the state. The gain, of shape
-        (runs, size), multiplies the deviation of a reading from the expected reading.
+        `_transition` describes F and Q. The gain, of shape (runs, size), multiplies the
+        difference between a reading and the forecast of the reading, where size is the length
+        of the state.
         """
         P = F @ self._covariance @ F.transpose(0, 2, 1) + Q
         variance = P[:, 0, 0] + self._numbers.measurement_noise_variance
@@ -254,25 +265,26 @@ class PredictiveController:
         return gain
 
     def _transition(self, k: int, plants: LinearModel) -> tuple[Array, Array]:
-        """Return the matrices F and Q of the Kalman filter for the step from k - 1 to k.
+        """Return the matrices F and Q of the Kalman filter for the step to sample k.
 
-        The state transition matrices F and the covariances Q of the process noise have the
+        F has the state transition matrices and Q the covariances of the process noise, both of
         shape (runs, size, size), where size is the length of the state. `plants` has the plants
         of all runs at sample k.
         """
-        stays = self._load_stays
+        no_jump_probability = self._no_jump_probability
         variances = self._variances
-        if k % LOAD_INTERVAL:  # The load does not change at this sample.
-            stays = np.ones_like(stays)
+        if k % LOAD_INTERVAL:
+            # The load does not change at this sample. Only the noise xi in v(k) has a variance.
+            no_jump_probability = np.ones_like(no_jump_probability)
             variances = variances * [1.0, 0.0, 0.0]
-        F, sources = plants.state_space_with_load(stays)
-        return F, np.einsum("nv,niv,njv->nij", variances, sources, sources)
+        F, E = plants.state_space_with_load(no_jump_probability)
+        return F, np.einsum("nv,niv,njv->nij", variances, E, E)
 
     def _predict(self) -> Array:
-        """Return the outputs that are expected if all flows from the present sample k on are 0.
+        """Return the expected outputs if all flows from the present sample k on are 0, degC.
 
-        The outputs are in degC. Column i has the outputs y(k + 1 + i) of all runs, and there
-        are as many columns as the longest delay plus HORIZON.
+        Column i has the output y(k + 1 + i) of all runs. The number of columns is HORIZON plus
+        the longest delay of a run.
         """
         runs = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
         flows = self._flows[runs, self._flow_columns[:, 1:]]
@@ -285,18 +297,19 @@ class PredictiveController:
         load = self._state[:, LOAD_STEPS] + self._state[:, LOAD_WALK]
         outputs = [self._state[:, i] for i in reversed(range(order))]  # the newest last
         for ahead, plants in enumerate(models, start=1):  # y(k + ahead)
-            output = effects[:, ahead - 1] + plants.load * load
+            output = effects[:, ahead - 1] + plants.load_factor * load
             for i in range(plants.alpha.shape[-1]):
                 output += plants.alpha[:, i] * outputs[-1 - i]
-            for i in range(ahead, len(c)):  # The values of xi after k are expected to be 0.
+            for i in range(ahead, len(c)):  # The noise xi after k is expected to be 0.
                 output += c[i] * noise[:, i - ahead]
             outputs.append(output)
         return np.stack(outputs[order:], axis=1)
 
     def _model(self, k: int) -> _Model:
-        """Return the plants of all runs in the step from sample k - 1 to sample k, as a model.
+        """Return the model of all runs' plants in the step from sample k - 1 to sample k.
 
-        Models are stored, since the plants change only every `DRIFT_INTERVAL` samples.
+        The method stores the models, since the plants change only every `DRIFT_INTERVAL`
+        samples.
         """
         first = 0
         if self._parameters.drifts:
@@ -312,21 +325,9 @@ class PredictiveController:
         """Return a plan whose first flow the actuator can apply, and the command for this flow.
 
         A first flow inside the dead zone is replaced by 0 or by the flow at the edge of the
-        dead zone, and the later flows are planned anew. The plan with the lower cost is chosen.
-
-        Parameters
-        ----------
-        model, slopes
-            The plants, and the argument `slopes` of `_Model.cost`.
-        plan
-            The planned flows, t/h, shape (HORIZON, runs).
-
-        Returns
-        -------
-        plan : Array
-            The changed plan, t/h, shape (HORIZON, runs).
-        command : Array
-            The command for the first planned flow, t/h, shape (runs,).
+        dead zone, whichever gives the plan with the lower cost after the later flows have been
+        planned anew. A plan has the planned flows of all runs, t/h, shape (HORIZON, runs). The
+        command is in t/h, shape (runs,). `slopes` is the argument of `_Model.cost`.
         """
         numbers = self._numbers
         flow = plan[0]
@@ -350,20 +351,11 @@ class PredictiveController:
         start: Array,
         first_flow: Array | float | None = None,
     ) -> Array:
-        """Return the plan with the least cost within the limits of the actuator.
+        """Return the plan with the least cost within the limits, t/h, shape (HORIZON, runs).
 
-        The plan is found by coordinate descent. It has the planned flows, t/h, shape (HORIZON,
-        runs).
-
-        Parameters
-        ----------
-        model, slopes
-            The plants, and the argument `slopes` of `_Model.cost`.
-        start
-            The planned flows with which the descent starts, t/h, shape (HORIZON, runs).
-        first_flow
-            A fixed value of the first planned flow, t/h, shape (runs,), or a number for all
-            runs; None if the first flow is planned, too.
+        Coordinate descent finds the plan, beginning with the planned flows `start`, t/h, shape
+        (HORIZON, runs). If `first_flow` is not None, the first planned flow is `first_flow`,
+        t/h, a number or an array of shape (runs,). `slopes` is the argument of `_Model.cost`.
         """
         plan = start.copy()
         free_flows = range(HORIZON)

@@ -1,7 +1,7 @@
-"""Compare the gains, time constants, delays and temperature ranges of two plants.
+"""Convert the intervals in which a search looks for gains from the paper's plant to another.
 
-With the ratios of these quantities, the intervals in which a search looks for the gains of a
-controller are converted from the paper's plant to another plant.
+The conversion uses the ratios of the gains, time constants, delays and temperature ranges of
+the two plants.
 """
 
 import math
@@ -25,13 +25,13 @@ NN_SPANS = {
     "weight_scale": (0.05, 2.0),
 }
 
-# The interval of each gain, by the gain's name: first the end of smaller magnitude.
+# The interval of each gain, by name. The end of smaller magnitude comes first.
 Spans = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class PlantScale:
-    """Quantities of a plant, from which the size of a controller's gains follows.
+    """Quantities of a plant, from which the suitable size of a controller's gains follows.
 
     If the plant is integrating, all quantities except the delay are infinite.
     """
@@ -57,7 +57,7 @@ def direction(plant: Parameters) -> int:
 
 
 def scale_of(plant: Parameters) -> PlantScale:
-    """Return the scale of the nominal plant, in the middle of all ranges of `plant`."""
+    """Return the scale of the nominal plant, which is in the middle of `plant`'s ranges."""
     model = nominal(plant)
     gain = abs(float(model.gain))
     half_range = (model.numbers.u_max - model.numbers.u_min) / 2.0  # t/h
@@ -77,15 +77,9 @@ def scale_of(plant: Parameters) -> PlantScale:
 def difference(plant: Parameters, made_for: Parameters) -> str:
     """Return a text with the quantities in which two plants differ by more than a factor 2.
 
-    An example is "the delay is 41 samples in place of 19". The text is "" if all quantities
-    differ by at most a factor 2.
-
-    Parameters
-    ----------
-    plant
-        The plant on which a controller runs.
-    made_for
-        The plant for which the controller was made.
+    An example of the text is "the delay is 41 samples in place of 19". The text is "" if all
+    quantities differ by at most a factor 2. A controller was made for the plant `made_for`, and
+    runs on the plant `plant`.
     """
     expected = vars(scale_of(made_for))
     parts = []
@@ -101,26 +95,28 @@ def difference(plant: Parameters, made_for: Parameters) -> str:
 def _finite_scale_of(plant: Parameters) -> PlantScale:
     """Return the scale of a plant on which a search for gains is to run.
 
-    A ValueError is raised if a quantity is 0 or infinite, since the intervals of a search are
-    proportional to ratios of quantities.
+    A ValueError is raised if a quantity is 0 or infinite, since the ends of the search
+    intervals are proportional to ratios of quantities.
     """
     scale = scale_of(plant)
     for name, value in vars(scale).items():
         if not 0.0 < value < math.inf:
             quantity, unit = QUANTITIES[name]
             raise ValueError(
-                f"the {quantity} must be finite and above 0 for a search, got {value:g} {unit}"
+                f"the {quantity} must be finite and above 0 for a search for gains, "
+                f"got {value:g} {unit}"
             )
     return scale
 
 
 def pi_spans(plant: Parameters) -> Spans:
-    """Return the intervals in which a search looks for the gains `kp` and `ki` on a plant.
+    """Return the intervals in which a search looks for the gains of a PI controller.
 
     A PI controller has a proportional gain `kp` in t/h per degC, and an integral gain `ki` in
-    t/h per degC and sample. The intervals for the paper's plant are multiplied by the gain of
-    the paper's plant divided by the gain of `plant`. The interval of `ki` is also multiplied by
-    the time constant of the paper's plant divided by the time constant of `plant`.
+    t/h per degC and sample. The intervals of `kp` and `ki` are the intervals for the paper's
+    plant times the gain of the paper's plant divided by the gain of `plant`. The interval of
+    `ki` is also multiplied by the time constant of the paper's plant divided by the time
+    constant of `plant`.
     """
     scale = _finite_scale_of(plant)
     paper_scale = scale_of(PAPER)
@@ -134,10 +130,11 @@ def pi_spans(plant: Parameters) -> Spans:
 def nn_spans(plant: Parameters) -> Spans:
     """Return the intervals in which a search looks for the gains of the paper's network.
 
-    The four gain factors of the learning rule multiply an error, and the input scale multiplies
-    temperatures. So the intervals for the paper's plant are multiplied by the temperature range
-    of the paper's plant divided by the temperature range of `plant`. The interval for the
-    initial weights, which have no unit, is the same for all plants.
+    The four gain factors of the network's learning rule multiply an error, and the input scale
+    of the network multiplies temperatures. So the intervals of the gain factors and of the
+    input scale are the intervals for the paper's plant times the temperature range of the
+    paper's plant divided by the temperature range of `plant`. The interval for the initial
+    weights, which have no unit, is the same for all plants.
     """
     factor = scale_of(PAPER).temperature_range / _finite_scale_of(plant).temperature_range
     factors = dict.fromkeys(NN_SPANS, factor) | {"weight_scale": 1.0}
@@ -145,11 +142,11 @@ def nn_spans(plant: Parameters) -> Spans:
 
 
 def dahlin_spans(plant: Parameters) -> Spans:
-    """Return the intervals in which a search looks for Dahlin's two time constants, s.
+    """Return the intervals in which a search looks for time constants of Dahlin's controller.
 
-    The interval for the closed-loop time constant of Dahlin's controller is proportional to the
-    time constant T of `plant`. The interval for the filter time constant is proportional to T
-    plus the delay of `plant`.
+    The interval for the closed-loop time constant, s, is proportional to the time constant of
+    `plant`. The interval for the filter time constant, s, is proportional to the sum of the
+    time constant and the delay of `plant`.
     """
     scale = _finite_scale_of(plant)
     time_constant = scale.time_constant * plant.sampling_interval
@@ -161,7 +158,7 @@ def dahlin_spans(plant: Parameters) -> Spans:
 
 
 def _scaled(spans: Spans, factors: Mapping[str, float]) -> Spans:
-    """Return intervals of gains with both ends multiplied by a factor.
+    """Return the intervals of gains, with both ends of each interval multiplied by a factor.
 
     `spans` has the interval of each gain, and `factors` has the factor of each gain, both by
     the name of the gain.

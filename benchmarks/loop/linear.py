@@ -1,13 +1,13 @@
-"""Describe the plant, and the loop of a controller and the plant, as linear systems.
+"""Describe the plant, and the closed loop of a controller and the plant, as linear systems.
 
 The plant is equation (28) of the paper with a load:
 
-    y(k) = sum_i alpha_i y(k-1-i) + sum_i beta_i u_a(k-d-1-i) + C(z^-1) xi(k) + A(1) w(k),
+    y(k) = sum_i alpha_i y(k-1-i) + sum_i beta_i u_a(k-d-1-i) + C(z^-1) xi(k) + A(1) w(k).
 
-where i counts from 0, y is the temperature (degC), u_a the flow that the actuator applies
+The index i counts from 0, y is the temperature (degC), u_a the flow that the actuator applies
 (t/h), d the delay (samples), xi white noise (degC) and w the load (degC). The coefficients
 alpha_i and beta_i are -a_(i+1) and b_i of the polynomials A and B, changed by the factors and
-drifts of gain and time constant.
+the drifts of the gain and of the time constant.
 """
 
 import itertools
@@ -26,51 +26,53 @@ from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers, slowest_pole
 
 Array = NDArray[np.float64]
 
-# Places of the two parts of the load in a state vector: the piecewise constant part, which
+# Indices of the two parts of the load in a state vector: the piecewise constant part, which
 # changes in steps, and the random walk.
 LOAD_STEPS, LOAD_WALK = -2, -1
 # Smith's method reads the times at which a step response reaches these shares of its final
 # value. A lag with the time constant T reaches the two shares after T / 3 and T.
 EARLY_LEVEL, LATE_LEVEL = 0.283, 0.632
-# Largest magnitude of a pole for which a step test is done: a step test would be too long for a
-# slower plant.
+# Largest magnitude of a plant's pole for which `step_test` does a step test. A step test of a
+# slower plant would be too long.
 SLOWEST_POLE = 1 - 1e-5
-REMAINING_TRANSIENT = 1e-5  # share of the slowest transient at the end of a step test
+REMAINING_TRANSIENT = 1e-5  # share of a transient that remains after a step test
 # Frequencies at which the sensitivity function is computed, rad per sample; pi is the highest
 # frequency of a sampled signal.
 FREQUENCIES = np.geomspace(1e-4, math.pi, 400)
-CIRCLE_POINTS = 1 << 14  # points on the unit circle with which unstable poles are counted
-LONGEST_DELAY = 1000  # samples; longer delays are not examined for stability
-TIME_CONSTANTS_TRIED = 24  # by `time_constant_for`, before the bisection
+CIRCLE_POINTS = 1 << 14  # points on the unit circle for the count of unstable poles
+LONGEST_DELAY = 1000  # samples; `stable_delays` examines no longer delay
+TIME_CONSTANTS_TRIED = 24  # number of time constants before the bisection
 PRECISION = 1e-5  # relative precision of the time constant that `time_constant_for` returns
 
 
 class LinearModel:
-    """The linear equation (28) of the paper for several plants, or for one plant.
+    """The coefficients of the linear equation (28) of the paper for one or several plants.
 
     A model has several plants at one sample k, or one plant at several samples k, or one plant
-    at one sample. The coefficients of a plant that drifts hold for the step from k - 1 to k. In
-    the shapes of arrays, dots stand for the axis of the plants or of the samples, which is
-    missing for one plant at one sample.
+    at one sample. The coefficients of a plant that drifts hold for the step from sample k - 1
+    to sample k. In the shapes of arrays, dots stand for the axis of the plants or of the
+    samples. A model of one plant at one sample has no axis in place of the dots.
 
     Parameters
     ----------
     parameters
-        The arguments of the environment.
+        Arguments of the environment.
     numbers
-        Plant numbers, such as the delay: floats for one plant, or arrays of shape (plants,).
+        Parameter values of the plants, such as the delay: floats for one plant, or arrays of
+        shape (plants,).
     k
-        A sample; or, for one plant, several samples, shape (samples,).
+        Number of the sample; or, for one plant, numbers of several samples, shape (samples,).
 
     Attributes
     ----------
     alpha
-        Factors of the temperatures y(k-1), y(k-2), ... in y(k), shape (..., order of A).
+        Factors of the temperatures y(k-1), y(k-2), ... in the equation of y(k), shape (...,
+        order of A).
     beta
-        Factors of the applied flows u_a(k-d-1), u_a(k-d-2), ... in y(k), degC per t/h, shape
-        (..., length of B), where d is the delay in samples.
-    load
-        Factor A(1) of the load w(k) in y(k), without a unit, shape (...).
+        Factors of the applied flows u_a(k-d-1), u_a(k-d-2), ... in the equation of y(k), degC
+        per t/h, shape (..., length of B), where d is the delay in samples.
+    load_factor
+        Factor A(1) of the load w(k) in the equation of y(k), without a unit, shape (...).
     """
 
     def __init__(
@@ -88,14 +90,13 @@ class LinearModel:
         self.beta: Array = np.broadcast_to(scale, shape)[..., np.newaxis] * np.array(
             parameters.b
         )
-        self.load = np.broadcast_to(load, shape)
+        self.load_factor = np.broadcast_to(load, shape)
 
     @property
     def gain(self) -> Array:
-        """Steady-state gain B(1) / A(1), degC per t/h, of each plant or at each sample.
+        """Steady-state gain B(1) / A(1) of each plant or at each sample, degC per t/h.
 
-        The gain of an integrating plant is infinite. A and B are the polynomials of equation
-        (28) of the paper.
+        The gain of an integrating plant is infinite.
         """
         with np.errstate(divide="ignore"):
             return np.asarray(self.beta.sum(axis=-1) / (1.0 - self.alpha.sum(axis=-1)))
@@ -104,8 +105,8 @@ class LinearModel:
     def limits(self) -> tuple[float, float]:
         """Lowest and highest flow that the actuator of one plant can apply, t/h.
 
-        If the actuator has a dead zone, the flow 0 is possible even where it is outside the
-        range from `u_min` to `u_max`.
+        If the actuator has a dead zone, the actuator can apply a flow of 0 t/h even if 0 t/h
+        lies outside the range from `u_min` to `u_max`.
         """
         flows = [self.numbers.u_min, self.numbers.u_max]
         if self.numbers.dead_zone > 0.0:
@@ -116,26 +117,28 @@ class LinearModel:
     def lag(self) -> int:
         """Number of samples from a flow to the first output that the flow can affect.
 
-        The lag is d + 1 for the delay d of the plant, plus the number of leading zeros in the
-        polynomial B of equation (28) of the paper. The model must have one plant.
+        By equation (28) of the paper, a flow at sample j affects the output y(j + d + 1) at the
+        earliest, where d is the plant's delay. So the lag is d + 1, plus the number of leading
+        zeros among the coefficients of the polynomial B. The model must have one plant.
         """
-        # The added 1 is found if all coefficients of B are 0.
+        # The appended 1 is the first nonzero number if all coefficients of B are 0.
         first_nonzero = np.flatnonzero([*self.parameters.b, 1.0])[0]
         return int(self.numbers.delay) + 1 + int(first_nonzero)
 
     @property
     def slowest_pole(self) -> float:
-        """Largest magnitude of a pole of a single plant; 0 for a plant without poles."""
+        """Largest magnitude of a pole of one plant; 0 for a plant without poles."""
         return abs(slowest_pole([1.0, *-self.alpha]))
 
     def impulse_response(self, samples: int) -> Array:
         """Return the impulse response of each plant, degC per t/h, shape (..., samples).
 
         The first value is the effect of a flow of 1 t/h at one sample on the output d + 1
-        samples later, where d is the delay of the plant in samples. Drifts of the plants are
-        left out. The dots in the shape stand for the axis of the plants.
+        samples later, where d is the delay of the plant in samples. The impulse response is
+        computed without drift of the plant. The dots in the shape stand for the axis of the
+        plants.
         """
-        response = np.zeros((*self.load.shape, samples))
+        response = np.zeros((*self.load_factor.shape, samples))
         response[..., : self.beta.shape[-1]] = self.beta[..., :samples]
         for k in range(1, samples):
             for i in range(min(self.alpha.shape[-1], k)):
@@ -151,19 +154,21 @@ class LinearModel:
         """Return the matrices F and g of the state equation x(k) = F x(k-1) + g xi(k).
 
         The state x(k) consists of the latest outputs y(k), y(k-1), ... and the latest values
-        xi(k), xi(k-1), ... of the white noise. The effects of flows and load are left out.
+        xi(k), xi(k-1), ... of the white noise. The state equation leaves out the effects of
+        flows and load.
 
         Returns
         -------
         F : Array
-            The state transition matrix, by plant or by sample, shape (..., size, size).
+            State transition matrix, for each plant or sample, shape (..., size, size), where
+            size is the length of the state.
         g : Array
-            The effect of the noise xi(k) on each element of the state, shape (size,).
+            Effect of the noise xi(k) on each element of the state, shape (size,).
         """
         c = self.parameters.c
         order = self.outputs_in_state
         size = order + len(c) - 1
-        F = np.zeros((*self.load.shape, size, size)) + np.eye(size, k=-1)
+        F = np.zeros((*self.load_factor.shape, size, size)) + np.eye(size, k=-1)
         xi_row = slice(order, order + 1)  # the row of xi(k); no row if C = 1
         F[..., xi_row, :] = 0.0  # xi(k) does not depend on x(k-1)
         F[..., 0, : self.alpha.shape[-1]] = self.alpha
@@ -173,39 +178,41 @@ class LinearModel:
         g[xi_row] = 1.0
         return F, g
 
-    def state_space_with_load(self, stays: Array) -> tuple[Array, Array]:
+    def state_space_with_load(self, no_jump_probability: Array) -> tuple[Array, Array]:
         """Return the matrices F and E of the state equation x(k) = F x(k-1) + E v(k).
 
         The state x(k) is the state of `state_space`, followed by the two parts of the load,
-        degC: the piecewise constant part at the place `LOAD_STEPS`, and the random walk at the
-        place `LOAD_WALK`. The effects of flows are left out. The vector v(k) has three
-        elements: the noise xi(k), the random change of the piecewise constant part, and the
-        step of the random walk.
+        degC: the piecewise constant part at the index `LOAD_STEPS`, and the random walk at the
+        index `LOAD_WALK`. The vector v(k) has three elements: the noise xi(k), the random
+        change of the piecewise constant part, and the step of the random walk. The state
+        equation leaves out the effects of flows.
 
         Parameters
         ----------
-        stays
-            The mean of the piecewise constant part at sample k as a share of its value at
-            sample k - 1; a number for each plant or sample.
+        no_jump_probability
+            Probability that the piecewise constant part of the load does not jump at sample k,
+            a number for each plant or sample. A jump leads to a level with the mean 0, so the
+            mean of the piecewise constant part is multiplied by this probability at sample k.
 
         Returns
         -------
         F : Array
-            The state transition matrix, by plant or by sample, shape (..., size, size).
+            State transition matrix, for each plant or sample, shape (..., size, size), where
+            size is the length of the state.
         E : Array
-            The effects of v(k) on each element of the state, shape (..., size, 3).
+            Effects of v(k) on each element of the state, shape (..., size, 3).
         """
         F_noise, g = self.state_space()
         size = len(g) + 2
-        F = np.zeros((*self.load.shape, size, size))
+        F = np.zeros((*self.load_factor.shape, size, size))
         F[..., :LOAD_STEPS, :LOAD_STEPS] = F_noise
-        F[..., LOAD_STEPS, LOAD_STEPS] = stays
+        F[..., LOAD_STEPS, LOAD_STEPS] = no_jump_probability
         F[..., LOAD_WALK, LOAD_WALK] = 1.0
-        F[..., 0, LOAD_STEPS] = self.load * stays
-        F[..., 0, LOAD_WALK] = self.load
-        E = np.zeros((*self.load.shape, size, 3))
+        F[..., 0, LOAD_STEPS] = self.load_factor * no_jump_probability
+        F[..., 0, LOAD_WALK] = self.load_factor
+        E = np.zeros((*self.load_factor.shape, size, 3))
         E[..., :LOAD_STEPS, 0] = g
-        E[..., 0, 1:] = self.load[..., np.newaxis]
+        E[..., 0, 1:] = self.load_factor[..., np.newaxis]
         E[..., LOAD_STEPS, 1] = 1.0
         E[..., LOAD_WALK, 2] = 1.0
         return F, E
@@ -214,7 +221,8 @@ class LinearModel:
 def nominal(parameters: Parameters) -> LinearModel:
     """Return the model of the nominal plant, which is in the middle of all ranges of arguments.
 
-    `parameters` are the arguments of the environment. The model holds at the sample k = 0.
+    `parameters` are the arguments of the environment. If the plant drifts, the model has the
+    plant's coefficients at sample k = 0.
     """
     middle = {name: sum(parameters.range_of(name)) / 2 for name in PLANT_NUMBERS}
     return LinearModel(parameters, PlantNumbers(**middle), 0)
@@ -224,16 +232,17 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     """Return the gain, time constant and delay that an engineer reads off a step response.
 
     The step response is the temperature of the nominal plant after a step of the flow, without
-    noise. With the times t_28 and t_63 at which the temperature has made 28.3 % and 63.2 % of
-    its change, the time constant is T = 1.5 (t_63 - t_28), and the delay is t_63 - T (C. L.
-    Smith, "Digital Computer Process Control", 1972). As if read off a chart, the gain is
-    rounded to four digits, the time constant to three digits, and the delay to a whole number
-    of samples. The delay is the time from a flow to the first output that the flow can affect.
+    noise. If the temperature has made 28.3 % and 63.2 % of its change at the times t_28 and
+    t_63, the time constant is T = 1.5 (t_63 - t_28), and the delay is t_63 - T (Cecil Smith,
+    "Digital Computer Process Control", 1972). As if read off a chart, the gain is rounded to
+    four digits, the time constant to three digits, and the delay to a whole number of samples.
+    The delay is the time from a flow to the first output that the flow can affect.
 
     Parameters
     ----------
     parameters
-        The arguments of the environment. The nominal plant is in the middle of all ranges.
+        Arguments of the environment, some of which may be ranges. The nominal plant is in the
+        middle of all ranges.
 
     Returns
     -------
@@ -244,20 +253,24 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     Raises
     ------
     ValueError
-        If the plant reaches no new steady state, or if the gain of the plant is 0.
+        If the plant reaches no new steady state after a step, or if the gain of the plant is 0.
     """
     plant = nominal(parameters)
     interval = parameters.sampling_interval
     if plant.slowest_pole > SLOWEST_POLE:
-        raise ValueError(f"a must belong to a stable plant for a step test, got {parameters.a}")
+        raise ValueError(
+            f"a must be a polynomial of a stable plant for a step test, got {parameters.a}"
+        )
     if plant.gain == 0.0:
-        raise ValueError(f"b must have a sum other than 0 for a gain, got {parameters.b}")
+        raise ValueError(
+            f"b must have coefficients whose sum is not 0 for a step test, got {parameters.b}"
+        )
     settling_time = 0.0  # samples
     if plant.slowest_pole > 0.0:
         settling_time = math.log(REMAINING_TRANSIENT) / math.log(plant.slowest_pole)
-    # Twice as long, as transients of repeated poles last longer.
+    # The test lasts twice the settling time, since transients of repeated poles last longer.
     samples = len(parameters.b) + 2 * math.ceil(settling_time) + 2
-    # The response begins with the last sample at which the output stands still.
+    # The response begins with the last sample before the output reacts.
     response = np.append(0.0, plant.impulse_response(samples).cumsum())
     response /= response[-1]
     late_time = _time_of(LATE_LEVEL, response)  # samples
@@ -276,8 +289,8 @@ def step_test(parameters: Parameters) -> dict[str, float]:
 def _time_of(level: float, response: Array) -> float:
     """Return the time at which a step response first reaches a level, in samples.
 
-    `response` has the step response at the samples 0, 1, ..., in the unit of `level`, and
-    begins below `level`. The response is interpolated linearly between samples.
+    `response` has the step response at the samples 0, 1, ..., in the unit of `level`, and is
+    interpolated linearly between samples. The first value of `response` must be below `level`.
     """
     k = int(np.argmax(response >= level))
     share = (level - response[k - 1]) / (response[k] - response[k - 1])
@@ -285,13 +298,13 @@ def _time_of(level: float, response: Array) -> float:
 
 
 class LinearController(Protocol):
-    """A controller that is linear while its commands pass the dead zone and the limits."""
+    """The interface of a controller with a linear transfer function."""
 
     def transfer(self) -> tuple[Array, Array]:
         """Return the transfer function from the error e (degC) to the command u (t/h).
 
-        The result is a numerator and a denominator, each an array of the coefficients of z^0,
-        z^-1, z^-2 and so on.
+        The transfer function is a pair, numerator and denominator, each an array of the
+        coefficients of z^0, z^-1, z^-2 and so on.
         """
 
 
@@ -302,10 +315,10 @@ class LinearLoop:
     Attributes
     ----------
     numerator, denominator : Array
-        The transfer function from the error e (degC) to the temperature y (degC), without the
-        delay of the plant: coefficients of z^0, z^-1 and so on.
+        Transfer function from the error e (degC) to the temperature y (degC), without the delay
+        of the plant: coefficients of z^0, z^-1 and so on.
     delay : int
-        The delay d of the plant, equation (28) of the paper, samples.
+        Delay d of the plant, equation (28) of the paper, samples.
     """
 
     numerator: Array
@@ -316,16 +329,17 @@ class LinearLoop:
     def of(cls, controller: LinearController, plant: LinearModel) -> "LinearLoop":
         """Return the closed loop of `controller` and `plant`, which must be a single plant."""
         controller_numerator, controller_denominator = controller.transfer()
-        # The coefficients of B begin at z^-1: a flow affects the next output at the earliest.
+        # The coefficients of B begin at z^-1, since a flow affects the next output at the
+        # earliest.
         numerator = np.convolve(controller_numerator, np.append(0.0, plant.beta))
         denominator = np.convolve(controller_denominator, np.append(1.0, -plant.alpha))
         return cls(numerator, denominator, round(plant.numbers.delay))
 
     def characteristic(self, delay: int) -> Array:
-        """Return the characteristic polynomial of the loop if the plant has a given delay.
+        """Return the loop's characteristic polynomial for a plant delay of `delay` samples.
 
-        The array has the coefficients of z^0, z^-1, z^-2 and so on. The poles of the loop are
-        the zeros of the characteristic polynomial in z. `delay` is in samples.
+        The array has the coefficients of z^0, z^-1, z^-2 and so on. The zeros of the
+        characteristic polynomial in z are the poles of the loop.
         """
         delayed_numerator = np.append(np.zeros(delay), self.numerator)
         return np.asarray(polyadd(self.denominator, delayed_numerator), np.float64)
@@ -337,11 +351,11 @@ class LinearLoop:
     def is_stable(self, delay: int) -> bool:
         """Return whether the loop is stable if the delay d of the plant is `delay` samples.
 
-        A loop is stable if all poles lie inside the unit circle. By the argument principle,
-        while z^-1 goes around the unit circle once, the characteristic polynomial turns about 0
-        once for each pole outside the circle.
+        A loop is stable if all poles lie inside the unit circle. While z^-1 goes around the
+        unit circle once, the characteristic polynomial goes around 0 once for each pole outside
+        the unit circle (argument principle).
         """
-        # The values of the characteristic polynomial at equidistant points on the circle.
+        # Values of the characteristic polynomial at equidistant points on the unit circle.
         values = np.fft.fft(self.characteristic(delay), CIRCLE_POINTS)
         if not values.all():  # A pole lies on the circle.
             return False
@@ -351,7 +365,7 @@ class LinearLoop:
     def sensitivity(self) -> float:
         """Return the maximum sensitivity Ms of the loop; infinite for an unstable loop.
 
-        Ms is the largest magnitude of the sensitivity function 1 / (1 + L) over the
+        Ms is the largest magnitude of the sensitivity function 1 / (1 + L) at the
         `FREQUENCIES`, where L is the transfer function from the error to the temperature.
         """
         if not self.is_stable(self.delay):
@@ -364,9 +378,9 @@ class LinearLoop:
     def stable_delays(self) -> tuple[int, int] | None:
         """Return the ends of the range of delays, in samples, with which the loop is stable.
 
-        The range contains the delay d of the plant, equation (28) of the paper. Delays above
-        `LONGEST_DELAY` are not examined. The result is None if the loop is unstable with the
-        delay of the plant.
+        The range of delays contains the delay of the plant. `stable_delays` does not examine
+        delays above `LONGEST_DELAY`. If the loop is unstable with the delay of the plant, None
+        is returned.
         """
         if not self.is_stable(self.delay):
             return None
@@ -387,21 +401,22 @@ def time_constant_for(
 ) -> float:
     """Return the smallest time constant of a controller with which a loop is robust enough, s.
 
-    A loop is robust enough if its maximum sensitivity Ms is at most `target`. The search starts
-    at the largest time constant and stops at the first that does not make the loop robust.
+    A loop is robust enough if the maximum sensitivity Ms of the loop is at most `target`. The
+    search tries time constants from the largest to the smallest, and stops at the first time
+    constant with which the loop is not robust enough.
 
     Parameters
     ----------
     target
-        The largest Ms that is allowed.
+        Largest allowed maximum sensitivity Ms.
     make
-        A function that takes a time constant, s, and returns a controller. A larger time
-        constant makes the loop more robust.
+        Function that takes a time constant, s, and returns a controller. A larger time constant
+        must make the loop more robust.
     plant
-        The model of a single plant.
+        Model of a single plant.
     slowest, fastest
-        The largest and the smallest time constant that are tried, s. If the loop is robust
-        enough with all time constants that are tried, the result is `fastest`.
+        Largest and smallest time constant that the search tries, s. If the loop is robust
+        enough with all tried time constants, `fastest` is returned.
 
     Raises
     ------
@@ -416,7 +431,8 @@ def time_constant_for(
     robust = list(itertools.takewhile(meets_target, tried))
     if not robust:
         raise ValueError(
-            f"no time constant up to {slowest:g} s gives the loop an Ms of {target:g} or less"
+            f"no time constant up to {slowest:g} s gives the loop a maximum sensitivity Ms of "
+            f"{target:g} or less"
         )
     if len(robust) == len(tried):
         return fastest

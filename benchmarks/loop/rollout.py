@@ -1,4 +1,4 @@
-"""Run a controller on a batch of plants, and compute measures of the runs, such as errors."""
+"""Run a controller on a batch of plants, and compute measures of each run, such as errors."""
 
 import itertools
 import math
@@ -20,9 +20,9 @@ Array = NDArray[np.float64]
 # Largest error of a settled output, divided by the set-point change (in `measure`) or by the
 # set point (in `settled`).
 SETTLING_BAND = 0.05
-START_SAMPLES = 300  # that count as the start of a run: half a period of the square wave
-RESPONSE_SAMPLES = 60  # after a set-point change that count as the response to the change
-LAST_SAMPLES = 50  # of a run, whose errors decide whether the output has settled
+START_SAMPLES = 300  # length of the start of a run: half a period of the square wave
+RESPONSE_SAMPLES = 60  # length of the response to a set-point change
+LAST_SAMPLES = 50  # number of last samples of a run from which `settled` decides
 
 
 class Agent(Protocol):
@@ -44,14 +44,14 @@ class IdleValve:
     Parameters
     ----------
     u_min, u_max
-        The limits of the actuator, t/h: arrays of shape (runs,), or numbers for all runs.
+        Limits of the actuator, t/h: arrays of shape (runs,), or numbers that apply to all runs.
     """
 
     def __init__(self, u_min: Any = -10.0, u_max: Any = 10.0) -> None:
         self.action = np.reshape(action_from_command(0.0, u_min, u_max), (-1, 1))
 
     def reset(self) -> None:
-        """Do nothing, since an idle valve has nothing to forget."""
+        """Do nothing, since an idle valve does not depend on earlier samples."""
 
     def act(self, observation: NDArray[np.float32]) -> Array:
         """Return the actions that keep the flow at 0 t/h, shape (runs, 1)."""
@@ -66,11 +66,11 @@ class Trajectory:
     output: Array  # the temperature y(k), degC
     command: Array  # the commanded flow u(k), t/h
     applied: Array  # the flow u_a(k) that the actuator applies, t/h
-    next_error: Array  # the error e(k + 1), degC, which decides the reward of the step from k
+    next_error: Array  # the error e(k + 1), degC, which determines the reward of step k
     next_setpoint: Array  # the set point y_d(k + 1), degC
 
     def __getitem__(self, samples: slice) -> "Trajectory":
-        """Return the signals at the samples of a slice, such as `trajectory[-50:]`."""
+        """Return the signals at a slice of the samples, such as `trajectory[-50:]`."""
         return Trajectory(*(signal[samples] for signal in vars(self).values()))
 
 
@@ -85,19 +85,19 @@ def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vect
 
 
 def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[Array]:
-    """Return the plant numbers that the environment draws for the runs of a batch.
+    """Return the parameter values that the environment draws for the plants of a batch.
 
-    Each plant number, such as the delay, is an array of shape (runs,), even if all runs have
-    the same number.
+    The result has an array of shape (runs,) for each parameter of a plant, such as the delay,
+    even if all runs have the same value.
 
     Parameters
     ----------
     parameters
-        The arguments of the environment, with the ranges.
+        Arguments of the environment, some of which may be ranges.
     runs
         Number of runs in the batch.
     seed
-        Seed of the first run: the seed of run i is `seed + i`.
+        Seed of the first run; run i has the seed `seed + i`.
     """
     numbers: dict[str, Any] = parameters.lowest.select(PLANT_NUMBERS)
     if parameters.ranges:
@@ -110,7 +110,7 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
 
 
 def is_random(parameters: Parameters) -> bool:
-    """Return whether noise, load, set points or plant are random, so that episodes differ."""
+    """Return whether noise, load, set points or plants are random, so that episodes differ."""
     _, largest_noise_variance = parameters.range_of("noise_variance")
     _, largest_reading_variance = parameters.range_of("measurement_noise_variance")
     return (
@@ -134,17 +134,17 @@ def rollout(
     Parameters
     ----------
     plants
-        The plants, a vector environment.
+        Vector environment of the plants.
     agent
-        The controller, which acts at the samples k = 0 to `samples - 1`.
+        Controller, which acts at the samples k = 0 to `samples - 1`.
     samples
-        Length of a run, in samples.
+        Length of a run, samples.
     seed
-        Seed of the first run: the environment draws the random numbers of run i, such as its
+        Seed of the first run. The environment draws the random numbers of run i, such as the
         noise, with the seed `seed + i`.
     before
-        A function that is called with k before the controller acts at sample k, for example to
-        record the weights of a network.
+        Function that is called with the sample number k before the controller acts at sample k,
+        for example to record the weights of a network.
     """
     clock = itertools.count()
 
@@ -160,8 +160,8 @@ def rollout(
     for sample, next_sample in itertools.pairwise(steps):
         info = sample.infos
         next_info = next_sample.infos
-        # In the order of the fields of `Trajectory`. The infos after a step have the command
-        # and the applied flow of the sample at which the step started.
+        # The signals are in the order of the fields of `Trajectory`. The infos after a step
+        # have the command and the applied flow of the sample at which the step started.
         signals_of_sample = [
             info["setpoint"],
             info["output"],
@@ -181,9 +181,10 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     error e(k) at the samples k = 1 to N, the measures are:
 
     - `mae`: mean of |e(k)|, degC;
-    - `mae_start`, `mae_changes`, `mae_steady`: the contributions of three parts of the run to
-      `mae`, degC: of the first `START_SAMPLES` samples, of the later samples that lie less
-      than `RESPONSE_SAMPLES` samples after a set-point change, and of the remaining samples;
+    - `mae_start`: contribution of the first `START_SAMPLES` samples to `mae`, degC;
+    - `mae_changes`: contribution to `mae` of the later samples that lie less than
+      `RESPONSE_SAMPLES` samples after a set-point change, degC;
+    - `mae_steady`: contribution of the remaining samples to `mae`, degC;
     - `ise`: integral of e^2 over time, degC^2 min;
     - `itae`: integral of t |e| over time, degC min^2, where t is the time since the latest
       set-point change;
@@ -222,13 +223,13 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
 def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
     """Return the contributions of three parts of a run to the mean error, degC, by name.
 
-    Each array has the shape (runs,). `measure` describes the three parts.
+    The arrays of contributions have the shape (runs,). `measure` describes the three parts.
     """
     errors = np.abs(trajectory.next_error)
     k = np.arange(1, len(errors) + 1)[:, np.newaxis]
     setpoint_moves = np.diff(trajectory.next_setpoint, axis=0, prepend=trajectory.setpoint[:1])
-    # The sample of the latest set-point change; so long ago, if there was none, that no sample
-    # belongs to its response.
+    # Sample number of the latest set-point change. Before the first change, the number is so
+    # small that no sample belongs to a response.
     changes = np.where(setpoint_moves != 0.0, k, -RESPONSE_SAMPLES)
     latest_change = np.maximum.accumulate(changes, axis=0)
     is_start = k < START_SAMPLES
@@ -243,8 +244,8 @@ def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
 def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]:
     """Return the shares of commands in the dead zone and at a limit, %, each of shape (runs,).
 
-    `command` has the commanded flows, t/h, shape (samples, runs). The shares are NaN if the
-    dead zone or a limit in `parameters` is a range.
+    The shares are NaN if the dead zone or a limit in `parameters` is a range. `command` has the
+    commanded flows, t/h, shape (samples, runs).
     """
     if {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
         unknown = np.full(command.shape[1], np.nan)
@@ -261,17 +262,18 @@ def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]
 
 
 class _StepMeasures(NamedTuple):
-    """Measures of one run that depend on the times of set-point changes; see `measure`."""
+    """Measures of one run that depend on the times of set-point changes."""
 
-    itae: float  # integral of time times |error|, degC samples^2
+    itae: float  # integral of time since the change times |error|, degC samples^2
     overshoot: float  # largest overshoot, divided by the set-point change
-    settling_time: float  # the longest, samples; infinite if the output does not settle
+    settling_time: float  # longest settling time, samples; may be infinite
 
 
 def _measure_steps(setpoint: Array, output: Array) -> _StepMeasures:
     """Return the measures of one run that depend on the times of set-point changes.
 
-    `setpoint` and `output` have the set point and the temperature, degC, shape (samples,).
+    `setpoint` has the set points and `output` the temperatures of the run, degC, both of shape
+    (samples,).
     """
     itae = 0.0
     overshoot = 0.0
@@ -282,7 +284,7 @@ def _measure_steps(setpoint: Array, output: Array) -> _StepMeasures:
         itae += float(np.arange(stop - start) @ np.abs(errors))
         change = setpoint[start] - previous_setpoint
         previous_setpoint = setpoint[start]
-        if change == 0.0:  # The run begins at set point 0.
+        if change == 0.0:  # The first set point is 0.
             continue
         overshoot = max(overshoot, float(np.max(-errors / change)))
         outside = np.flatnonzero(np.abs(errors) > SETTLING_BAND * abs(change))
@@ -296,10 +298,10 @@ def _measure_steps(setpoint: Array, output: Array) -> _StepMeasures:
 
 
 def held(setpoint: Array) -> list[tuple[int, int]]:
-    """Return the first sample and the end of each stretch with a constant set point.
+    """Return a pair (start, stop) for each period in which the set point is constant.
 
-    A stretch (start, stop) consists of the samples k = start to stop - 1. `setpoint` has the
-    set points of one run, degC, shape (samples,).
+    The pair (start, stop) stands for the samples k = start to stop - 1. `setpoint` has the set
+    points of one run, degC, shape (samples,).
     """
     changes = np.flatnonzero(np.diff(setpoint)) + 1
     return list(itertools.pairwise([0, *changes.tolist(), len(setpoint)]))
@@ -308,7 +310,7 @@ def held(setpoint: Array) -> list[tuple[int, int]]:
 def mean_error(trajectory: Trajectory) -> Array:
     """Return the mean absolute error of each run, degC, shape (runs,).
 
-    The mean is over the samples k = 1 to N, as no controller changes the error at k = 0.
+    The mean is over the samples k = 1 to N, since no controller can change the error at k = 0.
     """
     return np.asarray(np.abs(trajectory.next_error).mean(axis=0))
 
