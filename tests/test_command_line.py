@@ -82,7 +82,7 @@ REFUSED = {
     "identify": [
         (["none.csv"], "none.csv cannot be read: No such file"),
         ([LOG, "--u-min", "nan"], 'value "nan" for --u-min. Must be < inf'),
-        ([LOG, "--operating-flow", "1e9"], "operating_flow must be near the flows of the log"),
+        ([LOG, "--operating-flow", "1e9"], "--operating-flow must be near the flows"),
     ],
     "speed": [
         (["--device", "toaster"], "--device: device must be a device that PyTorch can use"),

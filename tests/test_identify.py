@@ -127,9 +127,11 @@ WAYS = {
     "a missing row": table().replace("\n64,3,1.25", ""),
 }
 REFUSED = {
-    "line 4: flow looks like thousands: '1,480'": table('16,"1,480" ,1'),
-    "line 4: flow looks like thousands: '1.480'": table("16,1.480,1").replace(",", ";"),
-    "line 4: a time step of 11.6 s: most time steps are 8": table("19.6,5,1"),
+    "line 4: flow must not have separators of thousands, got '1,480'": table('16,"1,480" ,1'),
+    "line 4: flow must not have separators of thousands, got '1.480'": table(
+        "16,1.480,1"
+    ).replace(",", ";"),
+    "line 4 comes 11.6 s after the line before, but most time steps are 8": table("19.6,5,1"),
     "line 10: .* dates begin with the month, write .* 2025-12-31": (
         dated("%m/%d/%Y %H:%M:%S", "01/02/2026 23:59:00")
     ),
