@@ -121,8 +121,8 @@ def read_log(options: Options) -> Log:
         if name not in table:
             columns = ", ".join(map(repr, table))
             raise UsageError(
-                f"the log has no column {name!r}; its columns are {columns}. Name the columns "
-                "with --time, --flow, --temperature and --disturbance"
+                f"the log must have a column {name!r}, but the columns are {columns}. Name the "
+                "columns with --time, --flow, --temperature and --disturbance"
             )
     if len({options.time, *names}) < len(names) + 1:
         raise UsageError(

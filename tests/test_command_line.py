@@ -89,7 +89,7 @@ REFUSED = {
     ],
     "sweep": [
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
-        (["--plants", "10"], "--plants and --design-seed are for --design random"),
+        (["--plants", "10"], "--plants and --design-seed need --design random"),
         (["--out", __file__], "cannot be written to: it is not a folder"),
     ],
     "tune": [
