@@ -250,8 +250,7 @@ def read_times(column: pd.Series[str], separator: str) -> NDArray[np.float64]:
 def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> None:
     """Raise a `UsageError` that names the first line of a column for which `is_bad` is true.
 
-    No error is raised if `is_bad` is false for all rows. `allowed` says what the column must
-    contain, such as "a number".
+    `allowed` says what the column must contain, such as "a number".
     """
     if is_bad.any():
         line = int(np.argmax(is_bad)) + 2
@@ -262,7 +261,7 @@ def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> Non
 def sample_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
     """Return the sample number of each row, counted from 0, and the sampling interval, s.
 
-    The numbers of missing rows are left out. `times`, s, and the sample numbers have the shape
+    A gap in the rows is a gap in the sample numbers. `times` has the time of each row, s, shape
     (rows,). A `UsageError` is raised if the times do not increase, if a row is more than 0.4
     sampling intervals early or late, or if 20 or more rows in succession are missing.
     """
@@ -293,8 +292,8 @@ def sample_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float
 def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
     """Return warnings for the report: a sentence for each reason why a fit may be wrong.
 
-    `intervals` is a result of `benchmarks.loop.identification.estimates`. `explained` is a
-    result of `benchmarks.loop.identification.explained_share`.
+    `intervals` is a table of estimates with 95 % intervals (`estimates`), and `explained` is
+    the share of the temperature's variance that the model explains (`explained_share`).
     """
     sentences = []
     last_third = fit.log.flow[-(len(fit.log.flow) // 3) :]
@@ -361,8 +360,8 @@ def doubts_about_sensor(temperature: NDArray[np.float64]) -> list[str]:
 def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
     """Return the arguments of the environment `MiddlePoint-v0` for the plant of a fit.
 
-    The flows in the result are deviations from the centre of the dead zone. If the plant cannot
-    follow the environment's default set point, the result has a set point with a smaller
+    All flows in the result are deviations from the centre of the dead zone, t/h. If the plant
+    cannot follow the environment's default set point, the result has a set point with a smaller
     amplitude or a longer period.
     """
     from benchmarks.loop.identification import polynomials
@@ -396,11 +395,7 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
 
 
 def is_one_sided(u_min: float, u_max: float) -> bool:
-    """Return whether one limit of the flow is much closer to the operating flow.
-
-    `u_min` and `u_max` are the limits of the flow minus the operating flow, t/h. "Much closer"
-    means less than a fifth of the distance of the other limit.
-    """
+    """Return whether nearly all flows from `u_min` to `u_max`, t/h, have the same sign."""
     return min(-u_min, u_max) < 0.2 * max(-u_min, u_max)
 
 
@@ -409,9 +404,8 @@ def argument_ranges(
 ) -> dict[str, list[float]]:
     """Return 95 % intervals of the environment's arguments, as ranges [low, high] by name.
 
-    An argument whose interval has the length 0 is left out. `intervals` is a result of
-    `benchmarks.loop.identification.estimates`, and `arguments` is a result of
-    `plant_arguments`.
+    An argument whose interval has the length 0 is left out. `intervals` is a table of estimates
+    with 95 % intervals (`estimates`), and `arguments` is a result of `plant_arguments`.
     """
     limits = intervals[["low", "high"]].T
     largest_flow = max(-arguments["u_min"], arguments["u_max"])
@@ -436,8 +430,8 @@ def findings(
 ) -> list[str]:
     """Return the paragraphs of the report that describe a fit and the plant.
 
-    `explained` is a result of `benchmarks.loop.identification.explained_share`, and `arguments`
-    is a result of `plant_arguments`.
+    `explained` is the share of the temperature's variance that the model explains
+    (`explained_share`), and `arguments` is a result of `plant_arguments`.
     """
     log, centre = fit.log, fit.zone.centre
     text = [
@@ -477,10 +471,7 @@ def findings(
 
 
 def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
-    """Return the identified parameters of the plant as a table of strings, for the report.
-
-    `intervals` is a result of `benchmarks.loop.identification.estimates`.
-    """
+    """Return a table of estimates with 95 % intervals as strings, for the report."""
     texts = intervals.map("{:.4g}".format)
     texts["95 % interval"] = "[" + texts.low + ", " + texts.high + "]"
     texts.insert(0, "", texts.index.str.replace("_", " "))

@@ -177,12 +177,10 @@ def tasks_of(
     nominal: Arguments,
     plants: Sequence[Arguments],
 ) -> dict[str, Any]:
-    """Return the tasks of a sweep: for each plant and controller, a function, by name.
+    """Return the tasks of a sweep by name: functions without arguments.
 
-    A task has no arguments. It runs the controller on the plant, and returns the result of
-    `run_agent`, or of `run_idle_valve` if the controller is an idle valve. The tasks of the
-    first plant have names such as "plant 0, nn" for the controller `nn`, and "plant 0" for the
-    idle valve.
+    The task "plant 0" returns the result of `run_idle_valve` on the first plant. The task
+    "plant 0, nn" returns the result of `run_agent` with the controller `nn` on the first plant.
 
     Parameters
     ----------
@@ -278,9 +276,7 @@ def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
     """Return the standard deviation of the error on steady stretches, degC, shape (runs,).
 
-    A steady stretch is the second half of the samples between two changes of the set point. The
-    result is the square root of the mean of the error's variances on all steady stretches of a
-    run.
+    A steady stretch is the second half of the samples between two changes of the set point.
     """
     errors = trajectory.setpoint - trajectory.output
     variances = []

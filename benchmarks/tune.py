@@ -105,10 +105,11 @@ CASES = {
 class Options:
     """Tune a controller's gains with Optuna, by default on the paper's plant.
 
-    All trials use the same set points and seeds, and no comparison uses them. The best gains
-    are written to the file `gains.json`, and `benchmarks.compare --agent NAME=gains.json` runs
-    the controller with these gains. If a search was stopped, the same command with the same
-    code continues the search, to the same result.
+    All trials use the same set points and seeds. No comparison uses the set points and seeds of
+    the trials. The best gains are written to the file `gains.json`. The command
+    `benchmarks.compare --agent NAME=gains.json` runs the controller with the gains in the file.
+    If a search was stopped, the same command with the same code continues the search, to the
+    same result.
     """
 
     controller: Annotated[str, Parameter(choices=SPANS)] = field(kw_only=False)
@@ -161,8 +162,7 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
 
     New runs are necessary because the best result of many trials is partly luck. A row has the
     numbers that `score` returns, and "in the search", the objective of the trial, degC.
-    `trials` is the table that `search` returns, and `plant` has the arguments of the
-    environment.
+    `trials` is the table that `search` returns.
     """
     import pandas as pd
 
@@ -179,7 +179,7 @@ def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
     """Return a table of the objectives of the controllers in `FIXED_GAINS[name]` on new runs.
 
     A row has the label of a controller, the origin of the gains, the gains, and the objective,
-    degC, all as strings. `plant` has the arguments of the environment.
+    degC, all as strings.
     """
     import pandas as pd
 
@@ -199,7 +199,7 @@ def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
 
     A range is a pair of values with the same sign: the value with the smallest magnitude, and
     the value with the largest magnitude. A `UsageError` is raised if the plant has no gain or
-    time constant that defines the ranges. `plant` has the arguments of the environment.
+    time constant that defines the ranges.
     """
     with blame("--plant"):
         return SPANS[name](Parameters(**plant))
@@ -208,7 +208,7 @@ def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
 def cases(plant: Arguments) -> dict[str, TuningCase]:
     """Return the cases of a search on a plant, by name: `CASES`, scaled to the plant.
 
-    `plant` has the arguments of the environment. The set points are scaled in proportion to
+    The set points are scaled in proportion to
     `setpoint_amplitude`, the lengths of the runs in proportion to `setpoint_period`, and the
     dead zone and the noise variance in proportion to the values of the plant. In the case
     "noise", even a plant without noise gets some noise. In the case "constant", the plant has
@@ -253,11 +253,11 @@ def middle(plant: Parameters, name: str) -> float:
 
 
 def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> pd.DataFrame:
-    """Try `count` sets of gains of a controller, and return a table with a row for each trial.
+    """Try `count` sets of gains of a controller, and return a table of the results of `score`.
 
-    A row has the numbers that `score` returns. After an interruption, the file `trials.csv` in
-    `folder` has the rows of the finished trials. A search that starts again tries the same
-    gains as before, and loads the results of finished trials from `folder`.
+    The table has a row for each trial. After an interruption, the file `trials.csv` in `folder`
+    has the rows of the finished trials. A search that starts again tries the same gains as
+    before, and loads the results of finished trials from `folder`.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     runs
         Number of runs of each case in a trial.
     folder
-        Folder of the results, which `results_folder` yields.
+        Folder of the results.
     """
     import optuna
     import pandas as pd

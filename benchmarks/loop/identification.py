@@ -65,7 +65,7 @@ class Log:
 
 
 class DeadZone(NamedTuple):
-    """Dead zone: an interval of flows that all act on a plant like the middle flow."""
+    """Dead zone of a valve: all flows in an interval act like the flow in the middle."""
 
     centre: float  # the middle of the interval, t/h
     half_width: float = 0.0  # half of the length of the interval, t/h; 0 for no dead zone
@@ -74,7 +74,7 @@ class DeadZone(NamedTuple):
         """Return the flows that act on the plant, t/h, if the flows `flow`, t/h, are commanded.
 
         A flow inside the dead zone is replaced by the centre of the dead zone, as in equation
-        (29) of the paper. The result has the shape of `flow`.
+        (29) of the paper.
         """
         is_inside = np.abs(flow - self.centre) < self.half_width
         return np.where(is_inside, self.centre, flow)
@@ -210,10 +210,10 @@ class Fit:
 
     @cached_property
     def background(self) -> Array:
-        """Signals that explain what neither noise nor flow changes cause, shape (rows, terms).
+        """Signals whose weighted sum is the temperature without noise and flow response.
 
-        The model adds the signals, multiplied by `coefficients`, to the flow response. The
-        first signal is 1 in all rows.
+        The weights are `coefficients`. The array has the shape (rows, terms), and the first
+        column is 1 in all rows.
         """
         slow, fast = self.unknowns.slow, self.unknowns.fast
         rows = np.arange(len(self.log.flow), dtype=np.float64)
@@ -232,7 +232,7 @@ class Fit:
 
     @cached_property
     def coefficients(self) -> Array:
-        """Factors of the columns of `background`, by linear least squares, shape (terms,)."""
+        """Weights of the columns of `background`, by linear least squares, shape (terms,)."""
         terms = self.whiten(self.background)
         target = self.whiten(self.log.temperature - self.flow_response)
         lengths = np.linalg.norm(terms, axis=0) + TINY
@@ -253,8 +253,8 @@ class Fit:
     def operating_temperature(self) -> float:
         """The steady temperature of the model if the flow is the centre of the dead zone, degC.
 
-        The loads and the measured disturbances are assumed to keep their values in the first
-        row of the log.
+        The loads and the measured disturbances are assumed to have the values of the first row
+        of the log.
         """
         first_flow = self.zone.passed(self.log.flow[:1])[0]
         change = self.unknowns.gain * (self.zone.centre - first_flow)
@@ -275,7 +275,7 @@ class Fit:
         return np.asarray(len(self.errors) * np.log(self.squares / (squares + TINY)))
 
     def try_candidates(self, target: Array, candidates: Array) -> tuple[Array, Array]:
-        """Fit a signal by `background` and one candidate, for each candidate alone.
+        """Fit a signal by a weighted sum of `background` and one candidate, for each candidate.
 
         `target` is the signal, degC, shape (rows,). `candidates` has a candidate in each
         column, in any unit, shape (rows, candidates). Two arrays of shape (candidates,) are
@@ -296,7 +296,7 @@ class Fit:
         return errors @ errors - products**2 / powers, products / powers
 
     def refined(self, evaluations: int = 25) -> "Fit":
-        """Return this fit with values of `unknowns` from nonlinear least squares.
+        """Return this fit with `unknowns` improved by nonlinear least squares.
 
         The search starts from the values in `unknowns`, and finds a local minimum of the sum of
         squared prediction errors. The returned fit has `standard_errors`. `evaluations` is the
@@ -361,9 +361,8 @@ def possible_zones(
 def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
     """Return a first fit of the model to a log, without a dead zone and with one lag.
 
-    A search starts from each time constant of a grid, with the best delay of a grid. The search
-    with the smallest sum of squared prediction errors gives the result. `log`, `zones` and
-    `end_row` are the arguments of `identify`.
+    The result is the best of several searches, which start from different time constants.
+    `log`, `zones` and `end_row` are the arguments of `identify`.
     """
     rows = len(log.flow)
     changes = log.flow - log.flow[0]
@@ -422,7 +421,8 @@ def with_zone(fit: Fit) -> Fit:
 def with_lags(fit: Fit) -> Fit:
     """Return `fit`, refined with one lag, or with two lags if two lags are clearly better.
 
-    "Clearly better" means an improvement (`Fit.improvement`) above `IMPROVEMENT_BY_SECOND_LAG`.
+    The second lag must improve the fit (`Fit.improvement`) by more than
+    `IMPROVEMENT_BY_SECOND_LAG`.
     """
     single = replace(fit, unknowns=fit.unknowns._replace(ratio=0.0)).refined()
     # In a model with two lags, the second lag replaces a part of the delay of one lag.
@@ -435,7 +435,7 @@ def with_load_steps(fit: Fit) -> Fit:
     """Return `fit` with new steps of unmeasured loads, which replace the load steps of `fit`.
 
     Up to `MOST_LOAD_STEPS` load steps are added one by one, always the step that improves the
-    fit most. No step is added if `Fit.improvement` is below `IMPROVEMENT_BY_LOAD_STEP`.
+    fit most. A load step is added only if it improves the fit by `IMPROVEMENT_BY_LOAD_STEP`.
     """
     fit = replace(fit, load_steps=())
     slow = fit.unknowns.slow
@@ -502,10 +502,10 @@ def estimates(fit: Fit) -> pd.DataFrame:
 def explained_share(fit: Fit) -> float:
     """Return how well a model of the first two thirds of a log predicts the last third.
 
-    A new model is fitted to the first two thirds of the log of `fit`. The new model simulates
-    the temperature in the last third from the flow and the measured disturbances. The result is
-    the share of the variance of the temperature in the last third that the simulation explains:
-    1 for a perfect simulation, and below 0 for a simulation that is worse than a constant.
+    A model that is fitted to the first two thirds of the log simulates the temperature in the
+    last third from the flow and the measured disturbances. The result is the share of the
+    variance of the temperature in the last third that the simulation explains: 1 for a perfect
+    simulation, and below 0 for a simulation that is worse than a constant.
     """
     end_row = 2 * len(fit.log.flow) // 3
     earlier = identify(fit.log, fit.zones, end_row)
@@ -514,15 +514,15 @@ def explained_share(fit: Fit) -> float:
 
 
 def polynomials(fit: Fit, delay: int) -> tuple[Array, Array, Array, float]:
-    """Return the polynomials A, B, C of equation (28) of the paper, and the variance of xi.
+    """Return the polynomials A, B, C of equation (28), and the variance of xi, degC^2.
 
-    The coefficients of A and C begin at z^0. The coefficients of B begin at z^-1, and are in
-    degC per t/h. The variance of the white noise xi is in degC^2.
+    The arrays A and C begin with the coefficient of z^0. The array B begins with the
+    coefficient of z^-1, in degC per t/h. `delay` is the delay of equation (28), samples.
 
-    Let `delay` be the delay of equation (28), samples. If the delay of the fit is from `delay`
-    to `delay + 1`, A and B reproduce the flow response of the fit exactly. If the delay of the
-    fit is shorter than `delay`, B leaves out the response before the sample `delay + 1`. C and
-    the variance are fitted to the recorded temperature minus the simulated temperature.
+    If the delay of the fit is from `delay` to `delay + 1`, A and B reproduce the flow response
+    of the fit exactly. If the delay of the fit is shorter than `delay`, B leaves out the
+    response before the sample `delay + 1`. C and the variance of xi are fitted to the recorded
+    temperature minus the simulated temperature.
     """
     unknowns = fit.unknowns
     lags = np.array([unknowns.slow, unknowns.fast])

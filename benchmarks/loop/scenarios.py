@@ -179,7 +179,9 @@ class PlantOptions:
         for text in self.set:
             name, equals, value = text.partition("=")
             if not (name and equals):
-                raise UsageError(f"--set must be ARGUMENT=VALUE, got {text!r}")
+                raise UsageError(
+                    f"--set must be ARGUMENT=VALUE, such as delay=30, got {text!r}"
+                )
             arguments[name] = value  # a bare word, such as random
             with suppress(ValueError):
                 arguments[name] = json.loads(value)
