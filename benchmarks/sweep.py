@@ -150,7 +150,7 @@ def work(options: Options) -> str:
 
 
 def design(options: Options, nominal: Arguments) -> list[Arguments]:
-    """Return, for each plant of the design, the arguments that differ from the nominal plant.
+    """Return, for each plant of a sweep, the arguments that differ from the nominal plant.
 
     `nominal` has the environment's arguments for the nominal plant. A `UsageError` is raised if
     `options` contradict each other, or if a plant is invalid.
@@ -190,9 +190,9 @@ def tasks_of(
         The controllers by name. A controller can have several members, such as networks that
         were trained with different seeds.
     nominal
-        The environment's arguments for the nominal plant.
+        Arguments of the environment for the nominal plant.
     plants
-        The arguments of each plant that differ from the nominal plant.
+        Arguments of the environment that differ from the nominal plant, for each plant.
     """
     members_of = {name: controller.members() for name, controller in controllers.items()}
     ranges = ranges_of(plants)
@@ -291,19 +291,20 @@ def table(
 ) -> pd.DataFrame:
     """Return a table with a row for each finished run of a controller on a plant.
 
-    The columns are the measures of `run_agent`, the arguments of the plant, and:
+    The columns are:
 
     - `plant`: the number of the plant;
     - `agent`: the name of the controller;
     - `limit`: the least possible mean error on the plant, degC;
     - `ratio`: the error ratio, which is the mean error divided by `limit`;
     - `oscillates`: whether the run oscillates;
-    - `useless`: whether the run is no better than an idle valve in the same noise.
+    - `useless`: whether the run is no better than an idle valve in the same noise;
+    - the measures of `run_agent` and the arguments of the plant, by name.
 
     Parameters
     ----------
     plants
-        The arguments of each plant that differ from the nominal plant.
+        Arguments of the environment that differ from the nominal plant, for each plant.
     agents
         The names of the controllers.
     results
@@ -385,9 +386,9 @@ def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.Data
 
     A difference is the mean error of the first controller in a pair minus the mean error of the
     second controller, degC, with a 95 % interval. The table has a column for each pair in
-    `pairs`, and a row for each group of plants in `GROUPS`. Plants on which a controller of a
-    pair has not finished are left out, and so are groups with fewer than two plants. `runs` is
-    the table that the function `table` returns.
+    `pairs`, and a row for each group of plants in `GROUPS`. Plants on which any controller of
+    the pairs has not finished are left out, and so are groups with fewer than two plants.
+    `runs` is the table that the function `table` returns.
     """
     import pandas as pd
 

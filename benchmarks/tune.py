@@ -46,8 +46,8 @@ PENALTY = 5.0
 LARGEST_ZONE = 0.95  # largest dead zone of a case, as a share of the larger limit of the flow
 # Functions that return the ranges of gains for a search, by the name of the controller.
 SPANS = {name: spec.spans for name, spec in ROSTER.items() if spec.spans}
-# For each controller of a search, the names of controllers in `ROSTER` that differ from it only
-# in the gains, and the origin of the gains as a text for the report.
+# By the name of the controller of a search: the controllers in `ROSTER` with the same structure
+# and other gains, each with the origin of the gains as a text for the report.
 FIXED_GAINS = {
     "nn": {"nn": "the search of version 0.1"},
     "pi": {"pi": "the paper", "pi-searched": "the search of version 0.1"},
@@ -208,11 +208,11 @@ def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
 def cases(plant: Arguments) -> dict[str, TuningCase]:
     """Return the cases of a search on a plant, by name: `CASES`, scaled to the plant.
 
-    The set points are scaled in proportion to
-    `setpoint_amplitude`, the lengths of the runs in proportion to `setpoint_period`, and the
-    dead zone and the noise variance in proportion to the values of the plant. In the case
-    "noise", even a plant without noise gets some noise. In the case "constant", the plant has
-    neither noise nor load, so that every good control loop can settle.
+    The set points are scaled in proportion to `setpoint_amplitude`, the lengths of the runs in
+    proportion to `setpoint_period`, and the dead zone and the noise variance in proportion to
+    the values of the plant. In the case "noise", even a plant without noise gets some noise. In
+    the case "constant", the plant has neither noise nor load, so that every good control loop
+    can settle.
     """
     parameters = Parameters(**plant)
     amplitude = parameters.setpoint_amplitude / PAPER.setpoint_amplitude
@@ -253,11 +253,11 @@ def middle(plant: Parameters, name: str) -> float:
 
 
 def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> pd.DataFrame:
-    """Try `count` sets of gains of a controller, and return a table of the results of `score`.
+    """Try `count` sets of gains of a controller, and return the results of `score` as rows.
 
-    The table has a row for each trial. After an interruption, the file `trials.csv` in `folder`
-    has the rows of the finished trials. A search that starts again tries the same gains as
-    before, and loads the results of finished trials from `folder`.
+    After an interruption, the file `trials.csv` in `folder` has the rows of the finished
+    trials. A search that starts again tries the same gains as before, and loads the results of
+    finished trials from `folder`.
 
     Parameters
     ----------

@@ -148,9 +148,9 @@ class PlantOptions:
     def cases(self, default: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
         """Return the cases of the chosen plant by name, or `default` if no plant is chosen.
 
-        The cases are "square" and "constant", with the set points in `SETPOINTS`. But if the
-        user's arguments of the plant define a set point, the only case is "run", with the
-        user's set point.
+        The cases are "square" and "constant", with the set points in `SETPOINTS`. If the user's
+        arguments of the plant define a set point, the only case is "run", with the user's set
+        point.
         """
         arguments = self.arguments()
         if not self.name:
@@ -256,11 +256,11 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
 
     If a variation has twice the delay of the paper's plant, then the returned variation has
     twice the delay of the other plant. Dead zones, gain factors and time constant factors are
-    scaled in proportion as well. The noise variance is scaled in proportion to the square of
-    the largest temperature change that the flow can cause.
+    scaled in proportion to the values of the two plants. Noise variances are scaled in
+    proportion to the square of the temperature change by half the range of the flow.
 
     `nominal_plant` has the environment's arguments for the other plant. A variation is a dict
-    of the arguments of the environment that differ from those of a nominal plant.
+    of the arguments of the environment that differ from a nominal plant.
     """
     scales = _scales(Parameters(**nominal_plant))
     paper_scales = _scales(Parameters())
