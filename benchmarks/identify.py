@@ -1,4 +1,4 @@
-"""Identify the plant of a recorded log: `python -m benchmarks.identify --help`."""
+"""Fit a plant to a log of flows and temperatures: `python -m benchmarks.identify --help`."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
     from benchmarks.loop.identification import Fit, Log
 
-FEWEST_ROWS = 100  # of a log; a shorter log hardly shows a delay and a lag
-MOST_ROWS = 10_000  # that are used: the last rows of a longer log, to limit time and memory
-LONGEST_GAP = 20  # sampling intervals between two rows; longer gaps are not interpolated
-MOST_MISSING = 0.2  # largest share of the values of a column that may be missing
+FEWEST_ROWS = 100  # smallest number of rows in a log, so that the fit can find the delay
+MOST_ROWS = 10_000  # largest number of rows in a fit, to limit time and memory
+LONGEST_GAP = 20  # longest time between two rows, in sampling intervals
+MOST_MISSING = 0.2  # largest share of the values in a column that may be missing
 # Matches one to three digits and then groups of three digits, each behind a point or a comma.
 # The comma in 1,480 may be a decimal mark, or may separate thousands.
 THOUSANDS = r"[+-]?[1-9]\d{0,2}([.,]\d{3})+"
@@ -38,23 +38,23 @@ CAPTION = "The log as it was recorded, and as the model simulates it from the fl
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Fit a plant to a recorded log, for the environment and for `compare --plant`.
+    """Fit a plant to a recorded log of flows and temperatures.
 
-    The log is a table with a heading; each row holds the temperature at its time and the flow
-    commanded from that time on.
+    A row of the log has a time, the temperature at this time, and the flow that is commanded
+    from this time on.
     """
 
     log: Path = field(kw_only=False)
-    """The log, a CSV file."""
+    """CSV file with the log, whose first line has the names of the columns."""
     out: Folder = Path("results/identify")
     time: str = "time"
-    """Column of the times, in seconds or as dates."""
+    """Name of the column of times, which are in seconds or are dates."""
     flow: str = "flow"
-    """Column of the flow."""
+    """Name of the column of flows."""
     temperature: str = "temperature"
-    """Column of the temperature."""
+    """Name of the column of temperatures."""
     disturbance: tuple[str, ...] = ()
-    """Column of a measured disturbance (repeatable)."""
+    """Name of the column of a measured disturbance (repeatable)."""
     applied: bool = False
     """The flow was measured behind the valve: the fit has no dead zone."""
     operating_flow: Finite | None = None
@@ -66,12 +66,12 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Identify the plant of a log, write all files, and return the closing message."""
+    """Fit a plant to a log, write the results, and return the last message for the user."""
     # SciPy reads this variable when SciPy is imported. With small matrices, several threads are
     # slower than one thread, as the threads wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-    from benchmarks.lib.report import Section, write_report  # here: slow to import, as below
+    from benchmarks.lib.report import Section, write_report  # imported here, as it is slow
     from benchmarks.loop.identification import (
         estimates,
         explained_share,
@@ -106,13 +106,12 @@ def work(options: Options) -> str:
 
 
 def read_log(options: Options) -> Log:
-    """Return the log in the file that the options name, with all gaps filled.
+    """Return the log in the CSV file `options.log`, with the missing values filled in.
 
-    A missing temperature is interpolated between its neighbours. A missing flow or disturbance
-    gets the value of the row before. A `UsageError` is raised if the log cannot be used; the
-    message says why.
+    A missing temperature is interpolated between the rows before and after. A missing flow or
+    disturbance gets the value of the row before. A `UsageError` says why a log cannot be used.
     """
-    import pandas as pd  # here: slow to import, as below
+    import pandas as pd  # imported here, as it is slow
 
     from benchmarks.loop.identification import Log
 
@@ -122,11 +121,14 @@ def read_log(options: Options) -> Log:
         if name not in table:
             columns = ", ".join(map(repr, table))
             raise UsageError(
-                f"the log has no column {name!r}; its columns are {columns}. Name the columns "
-                "with --time, --flow, --temperature and --disturbance"
+                f"the log must have a column {name!r}, but the columns are {columns}. Name the "
+                "columns with --time, --flow, --temperature and --disturbance"
             )
     if len({options.time, *names}) < len(names) + 1:
-        raise UsageError(f"a column is used twice: {', '.join([options.time, *names])}")
+        raise UsageError(
+            "--time, --flow, --temperature and --disturbance must name different columns, got "
+            f"{', '.join([options.time, *names])}"
+        )
     samples, interval = sample_numbers(read_times(table[options.time], separator))
     numbers = pd.DataFrame({name: read_numbers(table[name], separator) for name in names})
     # Samples that are missing in the log become rows without values.
@@ -134,18 +136,21 @@ def read_log(options: Options) -> Log:
     for name in names:
         share = numbers[name].isna().mean()
         if share > MOST_MISSING:
-            raise UsageError(f"{100 * share:.0f} % of the values of {name!r} are missing")
+            raise UsageError(
+                f"at most {100 * MOST_MISSING:.0f} % of the values in the column {name!r} may "
+                f"be missing, got {100 * share:.0f} %"
+            )
     filled = numbers.ffill().bfill()
     temperature = numbers[options.temperature].interpolate(limit_direction="both")
     filled[options.temperature] = temperature
     for name in (options.flow, options.temperature):
         if np.ptp(filled[name]) <= 1e-9 * filled[name].abs().max():
-            raise UsageError(f"{name!r} is constant: the log does not show a response")
+            raise UsageError(f"the column {name!r} must have at least two different values")
     flow = filled[options.flow].to_numpy()
     centre = options.operating_flow
     if centre is not None and np.abs(flow - centre).min() > np.ptp(flow):
         raise UsageError(
-            f"operating_flow must be near the flows of the log, {flow.min():g} to "
+            f"--operating-flow must be near the flows of the log, which are {flow.min():g} to "
             f"{flow.max():g}, got {centre:g}"
         )
     disturbances = filled[[*options.disturbance]].to_numpy()
@@ -153,11 +158,11 @@ def read_log(options: Options) -> Log:
 
 
 def read_table(path: Path) -> tuple[pd.DataFrame, str]:
-    """Return the table in a CSV file, and the separator of its columns.
+    """Return the table in a CSV file, and the character that separates the columns.
 
-    The cells of the table are texts, or NaN where a cell is empty. The separator is a semicolon
-    or a tab if the first line of the file has one, and otherwise a comma. A `UsageError` is
-    raised if the file is not a table or has fewer than `FEWEST_ROWS` rows.
+    The values of the table are strings, and NaN for empty cells. The separator is a semicolon
+    or a tab if the first line of the file contains one, and otherwise a comma. A `UsageError`
+    is raised if the file is not a table or has fewer than `FEWEST_ROWS` rows.
     """
     import pandas as pd
 
@@ -172,23 +177,23 @@ def read_table(path: Path) -> tuple[pd.DataFrame, str]:
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror}") from error
     except (pd.errors.EmptyDataError, pd.errors.ParserError) as error:
-        raise UsageError(f"{path} is not a table: {str(error).strip()}") from error
+        raise UsageError(f"{path} must be a table: {str(error).strip()}") from error
     # If rows are longer than the heading, pandas takes the first column as the index.
     if not isinstance(table.index, pd.RangeIndex):
         raise UsageError(
-            f"{path} has rows with more cells than the heading has names. Numbers with decimal "
-            "commas must be in quotes, or separated by semicolons or tabs"
+            f"no row of {path} may have more cells than the first row. Write numbers with "
+            "decimal commas in quotes, or separate the columns by semicolons or tabs"
         )
     if len(table) < FEWEST_ROWS:
-        raise UsageError(f"the log has {len(table)} rows; it must have at least {FEWEST_ROWS}")
+        raise UsageError(f"the log must have at least {FEWEST_ROWS} rows, got {len(table)}")
     return table.apply(lambda column: column.str.strip()), separator
 
 
 def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
-    """Return the numbers of a column of texts, with NaN for empty cells.
+    """Return the numbers in a column of strings, with NaN for empty cells.
 
-    A `UsageError` names the line of the first text that is not a number, or that looks like
-    thousands. `separator` is the mark between the columns of the file.
+    A `UsageError` names the first line whose text is not a number, or may have separators of
+    thousands, such as 1,480. `separator` is the character between the columns of the CSV file.
     """
     import pandas as pd
 
@@ -199,17 +204,17 @@ def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
     marked = column[has_mark]
     looks_like_thousands = bool(has_mark.any() and marked.str.fullmatch(THOUSANDS).all())
     if separator != ",":
-        # The mark may well be a decimal mark. But if it separates thousands, and is read as a
-        # decimal mark, then the largest numbers of the column become the smallest.
+        # A point or a comma is often a decimal mark in such a file. If a separator of thousands
+        # is read as a decimal mark, the largest numbers of the column become the smallest.
         sizes = numbers.abs()
         looks_like_thousands &= bool(sizes[has_mark].max() < sizes[~has_mark].min())
     if looks_like_thousands:
         raise UsageError(
-            f"line {marked.index[0] + 2}: {column.name} looks like thousands: "
-            f"{marked.iloc[0]!r}. Write the numbers without separators of thousands. If these "
-            "are decimals, write another number of digits behind the decimal mark"
+            f"line {marked.index[0] + 2}: {column.name} must not have separators of thousands, "
+            f"got {marked.iloc[0]!r}. If the points or commas are decimal marks, write more or "
+            "fewer than three decimals"
         )
-    # The square of a larger number might not be finite.
+    # The square of a number beyond 1e30 might not be finite.
     is_bad = ~(numbers.abs() < 1e30) & column.notna()
     refuse(column, is_bad, "a number, or empty if the value is missing")
     return numbers
@@ -218,9 +223,9 @@ def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
 def read_times(column: pd.Series[str], separator: str) -> NDArray[np.float64]:
     """Return the times of a column of numbers (s) or dates, in seconds, shape (rows,).
 
-    Dates become seconds since the first row. A `UsageError` names the line of the first text
-    that is neither a number nor a date. `separator` is the mark between the columns of the
-    file.
+    Dates are converted to seconds since the first row. A `UsageError` names the first line
+    whose text is neither a number nor a date. `separator` is the character between the columns
+    of the CSV file.
     """
     import pandas as pd
 
@@ -230,7 +235,8 @@ def read_times(column: pd.Series[str], separator: str) -> NDArray[np.float64]:
     else:
         is_iso = str(column.iloc[0])[:4].isdigit()  # ISO 8601 begins with the year
         form: Any = "ISO8601" if is_iso else "mixed"
-        # Other dates begin with the day, unless a second number is too large for a month.
+        # Dates in other forms are taken to begin with the day, unless the second number of a
+        # date is too large for a month.
         second_numbers = column.str.extract(SECOND_OF_DATE, expand=False).astype(np.float64)
         day_first = not is_iso and not (second_numbers > 12.0).any()
         dates = pd.to_datetime(
@@ -242,10 +248,9 @@ def read_times(column: pd.Series[str], separator: str) -> NDArray[np.float64]:
 
 
 def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> None:
-    """Raise a `UsageError` if a column of the log has texts that cannot be read.
+    """Raise a `UsageError` that names the first line of a column for which `is_bad` is true.
 
-    The message names the line of the first text for which `is_bad` is true. `allowed` says what
-    a text must be, such as "a number".
+    `allowed` says what the column must contain, such as "a number".
     """
     if is_bad.any():
         line = int(np.argmax(is_bad)) + 2
@@ -256,10 +261,9 @@ def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> Non
 def sample_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
     """Return the sample number of each row, counted from 0, and the sampling interval, s.
 
-    Where rows are missing, sample numbers are left out. `times` has the times of the rows, s,
-    and has the shape of the sample numbers, (rows,). A `UsageError` is raised if times do not
-    increase, if a row comes more than 0.4 sampling intervals early or late, or if 20 or more
-    rows in succession are missing.
+    A gap in the rows is a gap in the sample numbers. `times` has the time of each row, s, shape
+    (rows,). A `UsageError` is raised if the times do not increase, if a row is more than 0.4
+    sampling intervals early or late, or if 20 or more rows in succession are missing.
     """
     steps = np.diff(times)
     is_usual = np.abs(steps / np.median(steps) - 1.0) < 0.5
@@ -269,66 +273,71 @@ def sample_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float
     is_irregular = np.abs(exact_samples - samples)[1:] > 0.4
     is_irregular |= np.diff(samples) < 1.0  # two rows in one sample
     gap = (
-        "rows are missing before it. Divide the log there. If the dates begin with the month, "
-        "write dates such as 2025-12-31"
+        f"at most {LONGEST_GAP} sampling intervals may lie between two rows. Divide the log at "
+        "the gap. If the dates begin with the month, write dates such as 2025-12-31"
     )
     for is_bad, advice in (
-        (steps <= 0.0, "times must increase. Sort the rows, and remove repeated ones"),
+        (steps <= 0.0, "times must increase. Sort the rows, and remove repeated rows"),
         (steps > LONGEST_GAP * interval, gap),
         (is_irregular, f"most time steps are {interval:g} s. Resample the log"),
     ):
         if is_bad.any():
             row = int(np.argmax(is_bad))
-            raise UsageError(f"line {row + 3}: a time step of {steps[row]:g} s: {advice}")
+            raise UsageError(
+                f"line {row + 3} comes {steps[row]:g} s after the line before, but {advice}"
+            )
     return samples.astype(np.int64), interval
 
 
 def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
-    """Return the warnings of the report: a sentence for each reason why a fit may be wrong.
+    """Return warnings for the report: a sentence for each reason why a fit may be wrong.
 
-    `intervals` is the table of `benchmarks.loop.identification.estimates`, and `explained` is
-    the result of `explained_share` in the same module.
+    `intervals` is a table of estimates with 95 % intervals (`estimates`), and `explained` is
+    the share of the temperature's variance that the model explains (`explained_share`).
     """
     sentences = []
     last_third = fit.log.flow[-(len(fit.log.flow) // 3) :]
     if np.ptp(last_third) == 0.0:
         sentences.append(
-            "The flow does not move in the last third of the log, so the model could not be "
-            "checked there."
+            "The flow is constant in the last third of the log, so the model could not be "
+            "checked on new rows."
         )
     elif explained < 0.5:
         sentences.append(
             f"The model explains only {100 * max(explained, 0.0):.0f} % of the variance "
             "of the temperature in the last third of the log: the plant has changed, or "
-            "something other than the flow has moved the temperature."
+            "something other than the flow has changed the temperature."
         )
     if not is_white(fit.errors):
         sentences.append(
-            "The prediction errors are not white noise: the plant or its disturbances are not "
-            "of the model's form, and the intervals are too narrow."
+            "The prediction errors are not white noise: the model cannot describe the plant or "
+            "the disturbances exactly, and the 95 % intervals are too narrow."
         )
-    if len(fit.zones) == 2:  # as `possible_zones` returns them for such a flow
+    # `possible_zones` returns two dead zones if the flow has fewer than three values.
+    if len(fit.zones) == 2:
         sentences.append("The flow had fewer than three values: no dead zone can be found.")
     if intervals.low["gain"] <= 0.0 <= intervals.high["gain"]:
-        sentences.append("The interval of the gain holds 0: the sign of the gain is unknown.")
+        sentences.append(
+            "The interval of the gain contains 0: the sign of the gain is unknown."
+        )
     return sentences + doubts_about_sensor(fit.log.temperature)
 
 
 def is_white(errors: NDArray[np.float64]) -> bool:
-    """Return whether prediction errors, shape (blocks,), look like white noise.
+    """Return whether successive prediction errors, shape (blocks,), look like white noise.
 
-    Errors look like white noise if at most a quarter of their autocorrelations, at lags from 1
-    to 30 blocks, are larger than chance explains.
+    The result is true if chance explains at least three quarters of the autocorrelations of the
+    errors at lags from 1 to 30.
     """
     correlations = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
-    # By chance, few correlations of n blocks are larger than 2.5 / sqrt(n). Correlations up to
-    # 0.1 do no harm, even if they are not due to chance.
+    # By chance, about 1 % of the autocorrelations of n errors are larger than 2.5 / sqrt(n).
+    # Autocorrelations up to 0.1 do no harm, even if they are not due to chance.
     is_large = np.abs(correlations) > max(0.1, 2.5 / np.sqrt(len(errors)))
     return bool(np.mean(is_large) <= 0.25)
 
 
 def doubts_about_sensor(temperature: NDArray[np.float64]) -> list[str]:
-    """Return warnings if a recorded temperature, shape (rows,), was compressed or frozen."""
+    """Return a warning for each sign that temperatures, shape (rows,), are not measurements."""
     sentences = []
     moves = np.diff(temperature)
     span = np.ptp(temperature)
@@ -337,7 +346,7 @@ def doubts_about_sensor(temperature: NDArray[np.float64]) -> list[str]:
     if np.mean(is_straight & is_moving) > 1.0 / 3.0:
         sentences.append(
             "The temperature lies on straight lines between few values, as a historian that "
-            "compresses data keeps it: the delay and the intervals are not reliable."
+            "compresses data stores it: the delay and the 95 % intervals are not reliable."
         )
     changes = np.flatnonzero(np.r_[True, moves != 0.0, True])
     longest = int(np.diff(changes).max())  # number of rows in succession with one value
@@ -351,9 +360,9 @@ def doubts_about_sensor(temperature: NDArray[np.float64]) -> list[str]:
 def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
     """Return the arguments of the environment `MiddlePoint-v0` for the plant of a fit.
 
-    Flows are deviations from the centre of the dead zone. The options can set the limits of the
-    flow. If the plant cannot follow the environment's default set point, the set point has a
-    smaller amplitude or a longer period.
+    All flows in the result are deviations from the centre of the dead zone, t/h. If the plant
+    cannot follow the environment's default set point, the result has a set point with a smaller
+    amplitude or a longer period.
     """
     from benchmarks.loop.identification import polynomials
 
@@ -364,7 +373,8 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
     u_min = float(flow.min()) if options.u_min is None else options.u_min
     u_max = float(flow.max()) if options.u_max is None else options.u_max
     smaller_limit, larger_limit = sorted([-u_min, u_max])
-    # The set point has both signs, so the flow must move to both sides, if it can.
+    # The set point changes its sign, so the limit closer to 0 decides how large it can be. But
+    # a limit that is very close to 0 would make the set point useless.
     usable_limit = larger_limit if is_one_sided(u_min, u_max) else smaller_limit
     gain = abs(fit.unknowns.gain)
     settling = delay + round(4.0 * (fit.unknowns.slow + fit.unknowns.fast))  # samples
@@ -385,27 +395,23 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
 
 
 def is_one_sided(u_min: float, u_max: float) -> bool:
-    """Return whether the flow can hardly move to one side of the operating flow.
-
-    `u_min` and `u_max` are the limits of the flow, as deviations from the operating flow.
-    """
+    """Return whether nearly all flows from `u_min` to `u_max`, t/h, have the same sign."""
     return min(-u_min, u_max) < 0.2 * max(-u_min, u_max)
 
 
 def argument_ranges(
     intervals: pd.DataFrame, arguments: dict[str, Any]
 ) -> dict[str, list[float]]:
-    """Return the 95 % intervals of a plant as ranges of the environment's arguments.
+    """Return 95 % intervals of the environment's arguments, as ranges [low, high] by name.
 
-    A range is a list [low, high]. An argument whose interval has a length of 0 is left out.
-    `intervals` is the table of `benchmarks.loop.identification.estimates`, and `arguments` is
-    the result of `plant_arguments`.
+    An argument whose interval has the length 0 is left out. `intervals` is a table of estimates
+    with 95 % intervals (`estimates`), and `arguments` is a result of `plant_arguments`.
     """
     limits = intervals[["low", "high"]].T
     largest_flow = max(-arguments["u_min"], arguments["u_max"])
     gain_factors = limits.gain / intervals.value["gain"]
-    # A time constant factor f divides the rate of the plant's pole, which is 1 - pole, and the
-    # environment accepts factors above the rate.
+    # The environment divides 1 - p, with the pole p of the plant, by the time constant factor.
+    # Time constant factors must be larger than 1 - p.
     rates = 1.0 - np.exp(-arguments["sampling_interval"] / intervals.loc["time_constant"])
     lag_factors = np.clip(
         rates["value"] / rates[["low", "high"]], 1.000001 * rates["value"], 10.0
@@ -422,10 +428,10 @@ def argument_ranges(
 def findings(
     fit: Fit, explained: float, arguments: dict[str, Any], options: Options
 ) -> list[str]:
-    """Return the paragraphs of the report that follow the warnings.
+    """Return the paragraphs of the report that describe a fit and the plant.
 
-    `explained` is the result of `benchmarks.loop.identification.explained_share`, and
-    `arguments` is the result of `plant_arguments`.
+    `explained` is the share of the temperature's variance that the model explains
+    (`explained_share`), and `arguments` is a result of `plant_arguments`.
     """
     log, centre = fit.log, fit.zone.centre
     text = [
@@ -465,10 +471,7 @@ def findings(
 
 
 def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
-    """Return the identified parameters of the plant as a table of texts, for the report.
-
-    `intervals` is the table of `benchmarks.loop.identification.estimates`.
-    """
+    """Return a table of estimates with 95 % intervals as strings, for the report."""
     texts = intervals.map("{:.4g}".format)
     texts["95 % interval"] = "[" + texts.low + ", " + texts.high + "]"
     texts.insert(0, "", texts.index.str.replace("_", " "))
@@ -476,11 +479,7 @@ def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw(fit: Fit, title: str, path: Path) -> None:
-    """Draw the recorded and the simulated temperature of a log, and the flow, over time.
-
-    The simulation of the model in `fit` has no noise. `title` is the title of the picture, and
-    `path` is the PNG file.
-    """
+    """Draw a log and the temperature that a fitted model simulates, in the PNG file `path`."""
     from benchmarks.lib.pictures import COLOURS, DEAD_ZONE, open_picture
 
     log = fit.log

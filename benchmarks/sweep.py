@@ -29,12 +29,12 @@ from mptc_gym import Parameters
 if TYPE_CHECKING:
     import pandas as pd
 
-SAMPLES = 1200  # length of a run
+SAMPLES = 1200  # length of a run, samples
 SETPOINT: Arguments = {"setpoint": "square", "setpoint_period": 600}
 SEED = SEEDS["studies"].first  # seed of the first run on each plant, and of the bootstraps
 PLANTS = 200  # default number of plants in a random design
-# A run oscillates if the standard deviation of its error on steady stretches exceeds the
-# standard deviation with an idle valve by this number, degC.
+# A run oscillates if the standard deviation of the error on steady stretches is larger by this
+# number, degC, than the standard deviation with an idle valve.
 OSCILLATION_THRESHOLD = 1.0
 # Headings and number formats of the report's table, by the names of columns of `summarise`.
 COLUMNS = {
@@ -58,9 +58,9 @@ FAILURES = (
     "idle valve."
 )
 PICTURE = "The error of each controller on each plant, relative to the least possible error"
-# Groups of plants in a random design: a name, and a condition on the plants' arguments for
-# `DataFrame.query`. The limits of the delay divide the plants that drift into three groups of
-# about equal size.
+# Groups of the plants in a random design: the name of a group, and a condition on the arguments
+# of the plants for `DataFrame.query`. The delays 14 and 22 divide the plants that drift into
+# three groups of about equal size.
 GROUPS = {
     "no drift": "gain_drift.isna()",
     "all that drift": "gain_drift > 0",
@@ -68,7 +68,7 @@ GROUPS = {
     "drift, delay from 14 to 22 samples": "gain_drift > 0 and 14 <= delay <= 22",
     "drift, delay above 22 samples": "gain_drift > 0 and delay > 22",
 }
-# Questions of the report. For each question, the report compares pairs of controllers.
+# Questions of the report, and for each question the pairs of controllers to compare.
 QUESTIONS = {
     "Does online learning help when the plant drifts?": (
         ("nn", "pi-simc"),
@@ -94,22 +94,22 @@ DIFFERENCES = (
 class Options:
     """Run controllers on plants that they were not made for.
 
-    The nominal plant is the paper's plant, or the plant of --plant, --preset or --set. The
-    controllers are made for the nominal plant, and run on variations of the nominal plant.
+    The nominal plant is the paper's plant, or the plant that --plant, --preset or --set choose.
+    The controllers are made for the nominal plant, and run on variations of the nominal plant.
     """
 
     design: Literal["grid", "random"] = "grid"
     """grid: plants with 20 delays and 10 gains; random: plants that differ in delay, dead zone,
     noise, gain and time constant, half of which drift."""
     plants: Runs | None = None
-    """Plants of a random design (default: 200)."""
+    """Number of plants in a random design (default: 200)."""
     design_seed: Seed | None = None
-    """Seed for the plants of a random design (default: 0)."""
+    """Seed of the plants in a random design (default: 0)."""
     told: Literal["nominal", "each"] = "nominal"
     """nominal: every controller is made for the nominal plant; each: every controller is made
     for the plant that it controls, as the plant is before it drifts."""
     runs: Runs = 20
-    """Runs of a controller on a plant."""
+    """Number of runs of each controller on each plant."""
     agents: AgentNames = tuple(name for name, spec in ROSTER.items() if spec.swept)
     controllers: ControllerOptions = field(default_factory=ControllerOptions)
     plant: PlantOptions = field(default_factory=PlantOptions)
@@ -117,9 +117,9 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run the sweep, write its report and data, and return the closing message for users.
+    """Run the sweep, write the report and the data, and return the last message for the user.
 
-    After an error or an interruption, the results that have finished are written.
+    After an error or an interruption, the report and the data contain the finished runs.
     """
     controllers = chosen(options.agents, options.controllers.agent)
     nominal = options.plant.arguments()
@@ -127,13 +127,13 @@ def work(options: Options) -> str:
     tasks = tasks_of(options, controllers, nominal, plants)
     provenance = origin()
     target = options.out or Path(f"results/sweep-{options.design}")
-    # A user's own code may change between two runs, so its results are not kept for the next.
+    # A user's own code may change between two runs, so the results are not kept for later.
     conditions = None if options.controllers.agent else conditions_of("sweep", options)
     results: dict[str, Any] = {}
     with results_folder(target, conditions) as folder:
         kept = KeptResults(folder) if conditions else None
         try:
-            # After an error, `results` has what was streamed before the error.
+            # After an error, `results` has the results of the tasks that finished before.
             results.update(options.controllers.fan_out.stream(tasks, "sweep", kept))
         finally:
             missing = len(tasks) - len(results)
@@ -150,16 +150,16 @@ def work(options: Options) -> str:
 
 
 def design(options: Options, nominal: Arguments) -> list[Arguments]:
-    """Return, for each plant of the design, the arguments that differ from the nominal plant.
+    """Return, for each plant of a sweep, the arguments that differ from the nominal plant.
 
-    `nominal` holds the environment's arguments for the nominal plant. A `UsageError` is raised
-    if options contradict each other, or if a plant is invalid.
+    `nominal` has the environment's arguments for the nominal plant. A `UsageError` is raised if
+    `options` contradict each other, or if a plant is invalid.
     """
     plants: list[Arguments] = []
     if options.design == "random":
         plants = random_design(options.plants or PLANTS, options.design_seed or 0, SAMPLES)
     elif options.plants or options.design_seed is not None:
-        raise UsageError("--plants and --design-seed are for --design random")
+        raise UsageError("--plants and --design-seed need --design random, got --design grid")
     else:
         for gain_factor in np.linspace(0.75, 1.65, 10).round(6).tolist():
             for delay in range(2, 42, 2):
@@ -177,11 +177,10 @@ def tasks_of(
     nominal: Arguments,
     plants: Sequence[Arguments],
 ) -> dict[str, Any]:
-    """Return a function without arguments for each controller on each plant, by name.
+    """Return the tasks of a sweep by name: functions without arguments.
 
-    A function runs the controller on the plant, and returns the result of `run_agent`, or of
-    `run_idle_valve` for an idle valve. The name is "plant 0" for the idle valve on the first
-    plant, and "plant 0, nn" for the controller `nn` on the first plant.
+    The task "plant 0" returns the result of `run_idle_valve` on the first plant. The task
+    "plant 0, nn" returns the result of `run_agent` with the controller `nn` on the first plant.
 
     Parameters
     ----------
@@ -189,11 +188,11 @@ def tasks_of(
         The options of the command.
     controllers
         The controllers by name. A controller can have several members, such as networks that
-        were trained from different seeds.
+        were trained with different seeds.
     nominal
-        The environment's arguments for the nominal plant.
+        Arguments of the environment for the nominal plant.
     plants
-        For each plant, the arguments that differ from the nominal plant.
+        Arguments of the environment that differ from the nominal plant, for each plant.
     """
     members_of = {name: controller.members() for name, controller in controllers.items()}
     ranges = ranges_of(plants)
@@ -202,13 +201,13 @@ def tasks_of(
         case = {**nominal, **plant, **SETPOINT}
         tasks[f"plant {i}"] = partial(run_idle_valve, case, options.runs)
         for name, members in members_of.items():
-            # Each plant gets the next member of a controller, so that a map over the plants
-            # shows how much the members differ.
+            # Successive plants get successive members of a controller, so that a map over the
+            # plants shows how much the members differ.
             member = members[i % len(members)]
             prior = case
             if options.told == "nominal":
                 prior = {**nominal, **SETPOINT}
-                # A self-tuning controller knows between which plants it has to adapt.
+                # A self-tuning controller knows the ranges of delay and dead zone.
                 if "delay_range" in member.prior_knowledge:
                     prior |= ranges
             tasks[f"plant {i}, {name}"] = partial(run_agent, member, prior, case, options.runs)
@@ -216,9 +215,9 @@ def tasks_of(
 
 
 def ranges_of(plants: Sequence[Arguments]) -> Arguments:
-    """Return the ranges [lowest, highest] of `delay` and `dead_zone` over the plants.
+    """Return the ranges [lowest, highest] of `delay` and `dead_zone` over the plants, by name.
 
-    An argument that is the same for all plants is left out.
+    The range of an argument that is the same for all plants is left out.
     """
     ranges: Arguments = {}
     for name in ("delay", "dead_zone"):
@@ -231,24 +230,25 @@ def ranges_of(plants: Sequence[Arguments]) -> Arguments:
 def run_agent(
     controller: ControllerSpec, prior: Arguments, case: Arguments, runs: int
 ) -> dict[str, Any]:
-    """Run a controller on a plant, and return measures of the runs, each of shape (runs,).
+    """Run a controller on a plant, and return measures of each run, arrays of shape (runs,).
 
     Parameters
     ----------
     controller
         The controller.
     prior
-        The environment's arguments for the plant that the controller is made for.
+        Arguments of the environment for the plant that the controller is made for.
     case
-        The environment's arguments for the plant on which the controller runs.
+        Arguments of the environment for the plant on which the controller runs.
     runs
         Number of runs.
 
     Returns
     -------
     dict
-        `run`, the number of the run; the measures of `benchmarks.loop.rollout.measure` by name;
-        and `swing`, degC, the result of the function `swing`.
+        The measures by name: `run`, the number of the run; the measures that
+        `benchmarks.loop.rollout.measure` returns; and `swing`, the result of the function
+        `swing`, degC.
     """
     agent = controller.in_service(prior, runs, SEED)
     trajectory = controller.run(case, SAMPLES, runs, SEED, agent)
@@ -257,12 +257,12 @@ def run_agent(
 
 
 def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
-    """Run an idle valve on a plant, and return its measures and the least possible error.
+    """Return measures of runs with an idle valve on a plant, and the least possible error.
 
-    `case` holds the environment's arguments for the plant, and `runs` is the number of runs.
-    The result has the measures of `run_agent`, and `least_possible`, the least possible mean
-    error of any controller, degC. `least_possible` is NaN if the plant does not settle between
-    changes of the set point.
+    `case` has the environment's arguments for the plant, and `runs` is the number of runs. The
+    result has the measures of `run_agent`, and "least_possible", the least possible mean error
+    of any controller, degC. The least possible mean error is NaN if the plant does not settle
+    between changes of the set point.
     """
     from benchmarks.bounds.least import least_possible
 
@@ -276,8 +276,7 @@ def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
     """Return the standard deviation of the error on steady stretches, degC, shape (runs,).
 
-    A steady stretch is the second half of the samples between two changes of the set point. The
-    variance of the error is averaged over all steady stretches of a run.
+    A steady stretch is the second half of the samples between two changes of the set point.
     """
     errors = trajectory.setpoint - trajectory.output
     variances = []
@@ -290,25 +289,26 @@ def swing(trajectory: Trajectory) -> NDArray[np.float64]:
 def table(
     plants: Sequence[Arguments], agents: Sequence[str], results: Mapping[str, Any]
 ) -> pd.DataFrame:
-    """Return a table with a row for each run that has finished.
+    """Return a table with a row for each finished run of a controller on a plant.
 
-    The columns are the measures of `run_agent`, the arguments of the plant, and:
+    The columns are:
 
     - `plant`: the number of the plant;
     - `agent`: the name of the controller;
     - `limit`: the least possible mean error on the plant, degC;
     - `ratio`: the error ratio, which is the mean error divided by `limit`;
     - `oscillates`: whether the run oscillates;
-    - `useless`: whether the run is no better than an idle valve in the same noise.
+    - `useless`: whether the run is no better than an idle valve in the same noise;
+    - the measures of `run_agent` and the arguments of the plant, by name.
 
     Parameters
     ----------
     plants
-        For each plant, the arguments that differ from the nominal plant.
+        Arguments of the environment that differ from the nominal plant, for each plant.
     agents
         The names of the controllers.
     results
-        The results of the tasks that have finished, by the names that `tasks_of` returns.
+        The results of the finished tasks, by the names of the tasks in `tasks_of`.
     """
     import pandas as pd
 
@@ -330,7 +330,7 @@ def table(
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with a row for each controller.
+    """Return a table of results over all runs, with a row for each controller.
 
     The columns are:
 
@@ -338,7 +338,8 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     - `multiple` and `multiple_p90`: the median and the 90th percentile over the plants, where
       the value of a plant is the median of `ratio` over the runs on the plant;
     - `travel`: the median valve travel of the runs, t/h;
-    - `oscillates` and `useless`: the shares of the runs for which these columns are true, %.
+    - `oscillates`: the share of the runs that oscillate, %;
+    - `useless`: the share of the runs that are no better than an idle valve, %.
 
     `runs` is the table that the function `table` returns.
     """
@@ -357,7 +358,7 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Argum
 
     If plants drift, the report has a table for each of `QUESTIONS` whose controllers have run.
     `runs` is the table that the function `table` returns. `provenance` has the command, the
-    commit and the versions.
+    commit of the code and the versions of Python and of packages.
     """
     from benchmarks.lib.report import Section, write_report
     from benchmarks.plots.sweep import draw
@@ -381,12 +382,13 @@ def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Argum
 
 
 def differences(runs: pd.DataFrame, pairs: Sequence[tuple[str, str]]) -> pd.DataFrame:
-    """Return a table of the differences between the mean errors of two controllers, as text.
+    """Return a table of the differences between the mean errors of two controllers, as strings.
 
     A difference is the mean error of the first controller in a pair minus the mean error of the
-    second controller, degC, with a 95 % interval. The table has a column for each of `pairs`,
-    and a row for each of `GROUPS` with at least two plants on which all controllers of the
-    pairs have finished. `runs` is the table that the function `table` returns.
+    second controller, degC, with a 95 % interval. The table has a column for each pair in
+    `pairs`, and a row for each group of plants in `GROUPS`. Plants on which any controller of
+    the pairs has not finished are left out, and so are groups with fewer than two plants.
+    `runs` is the table that the function `table` returns.
     """
     import pandas as pd
 

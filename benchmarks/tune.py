@@ -34,20 +34,20 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SEED = SEEDS["sampler"].first  # seed of Optuna's sampler in the first trial
-STARTUP = 200  # number of trials with random gains, before the sampler learns from trials
+STARTUP = 200  # number of trials with random gains, before Optuna's sampler chooses gains
 FIRST_RUN = SEEDS["preparation"].first  # seed of the first run of every trial
-SPACING_OF_CASES = 100_000  # between the first seeds of two successive cases
-FINALISTS = 10  # number of best trials that are judged again on new runs
-FINAL_RUNS = 1000  # runs of each case, to judge gains on new runs
-FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first of these runs
+SPACING_OF_CASES = 100_000  # difference between the first seeds of two successive cases
+FINALISTS = 10  # number of best trials whose gains are scored again on new runs
+FINAL_RUNS = 1000  # number of new runs of each case
+FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first new run
 # Penalty for a run that does not settle, degC: the mean error of an idle valve if the set point
 # is 5 degC.
 PENALTY = 5.0
 LARGEST_ZONE = 0.95  # largest dead zone of a case, as a share of the larger limit of the flow
-# The functions that return the intervals of a search on a plant, by the name of the controller.
+# Functions that return the ranges of gains for a search, by the name of the controller.
 SPANS = {name: spec.spans for name, spec in ROSTER.items() if spec.spans}
-# The controllers of other commands that differ from the controller of a search in their gains
-# only, and the origin of their gains: a text for the report.
+# By the name of the controller of a search: the controllers in `ROSTER` with the same structure
+# and other gains, each with the origin of the gains as a text for the report.
 FIXED_GAINS = {
     "nn": {"nn": "the search of version 0.1"},
     "pi": {"pi": "the paper", "pi-searched": "the search of version 0.1"},
@@ -77,10 +77,10 @@ QUIET: Arguments = {
 
 
 class TuningCase(NamedTuple):
-    """A case on which a search evaluates controllers."""
+    """A case on which a search for gains evaluates a controller."""
 
-    samples: int  # length of a run
-    first: int  # first sample that counts in the mean error
+    samples: int  # length of a run, samples
+    first: int  # number of the first sample that counts in the mean error
     arguments: Arguments  # arguments of the environment
 
 
@@ -105,24 +105,25 @@ CASES = {
 class Options:
     """Tune a controller's gains with Optuna, by default on the paper's plant.
 
-    All trials use the same set points and seeds, which no comparison uses. The command
-    `benchmarks.compare --agent NAME=gains.json` runs the controller with the best gains, which
-    are in the file `gains.json`. If a search was stopped, the same command with the same code
-    continues the search, to the same result.
+    All trials use the same set points and seeds. No comparison uses the set points and seeds of
+    the trials. The best gains are written to the file `gains.json`. The command
+    `benchmarks.compare --agent NAME=gains.json` runs the controller with the gains in the file.
+    If a search was stopped, the same command with the same code continues the search, to the
+    same result.
     """
 
     controller: Annotated[str, Parameter(choices=SPANS)] = field(kw_only=False)
-    """The controller whose gains to search."""
+    """Name of the controller whose gains to search."""
     trials: Runs = 800
-    """How many sets of gains to try."""
+    """Number of sets of gains to try."""
     runs: Runs = 100
-    """Runs of each case in a trial."""
+    """Number of runs of each case in a trial."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     out: Folder = Path("results/tune")
 
 
 def work(options: Options) -> str:
-    """Run the search, write and print its results, and return the closing message for users."""
+    """Search for gains, write the results, and return the last message for the user."""
     from benchmarks.lib.report import Section, write_report
 
     provenance = origin()
@@ -139,6 +140,7 @@ def work(options: Options) -> str:
             "controller": name,
             "gains": finalists.loc[0, gains].to_dict(),
             "plant": plant,
+            # A text for the column "prior knowledge" of the reports of `benchmarks.compare`.
             "knows": "gains of a search on this plant",
             "searched": f"{len(gains)} gains by {budget}",
         }
@@ -147,7 +149,7 @@ def work(options: Options) -> str:
         best = Section(title, [NOTE, FINALS_NOTE], finalists.map("{:.4g}".format))
         fixed = Section("Gains before this search", [FIXED_NOTE], fixed_gains(name, plant))
         write_report(folder, f"Gains: {ROSTER[name].label}", [best, fixed], provenance)
-    words = [*options.plant.words(), "--agent", f"my-{name}={target}/gains.json"]
+    words = [*options.plant.command_line(), "--agent", f"my-{name}={target}/gains.json"]
     return (
         f"All trials are in {target}/trials.csv, and the best gains are in {target}/report.md. "
         "The following command compares the best gains with other controllers: python -m "
@@ -156,12 +158,11 @@ def work(options: Options) -> str:
 
 
 def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
-    """Score the best trials of a search on new runs, and return a row for each, best first.
+    """Return a table of the scores of the best `FINALISTS` trials on new runs, best first.
 
-    The best gains of a search owe some of their result to luck, and new runs show how much. A
-    row has the numbers that `score` returns, and "in the search", the objective of the trial,
-    degC. `trials` is the table that `search` returns, and `plant` has the arguments of the
-    environment.
+    New runs are necessary because the best result of many trials is partly luck. A row has the
+    numbers that `score` returns, and "in the search", the objective of the trial, degC.
+    `trials` is the table that `search` returns.
     """
     import pandas as pd
 
@@ -175,11 +176,10 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
-    """Score the gains that other commands use on new runs, and return a table of texts.
+    """Return a table of the objectives of the controllers in `FIXED_GAINS[name]` on new runs.
 
-    The controllers with these gains are in `FIXED_GAINS`. A row has the label of a controller,
-    the origin of its gains, the gains, and the objective, degC. `name` is the name of the
-    controller whose gains were searched, and `plant` has the arguments of the environment.
+    A row has the label of a controller, the origin of the gains, the gains, and the objective,
+    degC, all as strings.
     """
     import pandas as pd
 
@@ -195,30 +195,30 @@ def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
 
 
 def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
-    """Return the interval of the search for each gain of a controller, by the gain's name.
+    """Return the range in which to search for each gain of a controller, by the gain's name.
 
-    An interval is a pair: the value with the smallest magnitude, and the value with the largest
-    magnitude, both of the same sign. A `UsageError` is raised if the plant has no gain or time
-    constant that defines the intervals. `plant` has the arguments of the environment.
+    A range is a pair of values with the same sign: the value with the smallest magnitude, and
+    the value with the largest magnitude. A `UsageError` is raised if the plant has no gain or
+    time constant that defines the ranges.
     """
     with blame("--plant"):
         return SPANS[name](Parameters(**plant))
 
 
 def cases(plant: Arguments) -> dict[str, TuningCase]:
-    """Return the cases of a search on a plant, by name: scaled versions of `CASES`.
+    """Return the cases of a search on a plant, by name: `CASES`, scaled to the plant.
 
-    `plant` holds arguments of the environment. Set points are scaled in proportion to
-    `setpoint_amplitude`, the lengths of runs in proportion to `setpoint_period`, and dead zone
-    and noise in proportion to the plant's own values. A plant without noise gets some noise in
-    the case "noise". In the case "constant" there are neither noise nor load, so that every
-    good loop can settle.
+    The set points are scaled in proportion to `setpoint_amplitude`, the lengths of the runs in
+    proportion to `setpoint_period`, and the dead zone and the noise variance in proportion to
+    the values of the plant. In the case "noise", even a plant without noise gets some noise. In
+    the case "constant", the plant has neither noise nor load, so that every good control loop
+    can settle.
     """
     parameters = Parameters(**plant)
     amplitude = parameters.setpoint_amplitude / PAPER.setpoint_amplitude
     duration = parameters.setpoint_period / PAPER.setpoint_period
     noise = middle(parameters, "noise_variance") / PAPER_NOISE
-    if noise == 0.0:  # Then the noise is in proportion to the squared temperature changes.
+    if noise == 0.0:  # The noise variance is scaled with the square of temperature changes.
         scale, paper_scale = scale_of(parameters), scale_of(PAPER)
         noise = (scale.temperature_range / paper_scale.temperature_range) ** 2
     factors = {
@@ -248,16 +248,16 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
 
 
 def middle(plant: Parameters, name: str) -> float:
-    """Return the middle of the range of the argument `name` of a plant."""
+    """Return the middle of the range [low, high] of the argument `name` of a plant."""
     return sum(plant.range_of(name)) / 2.0
 
 
 def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> pd.DataFrame:
-    """Try sets of gains of a controller, and return a table with a row for each trial.
+    """Try `count` sets of gains of a controller, and return the results of `score` as rows.
 
-    A row has the numbers that `score` returns. After an interruption, the rows of the finished
-    trials are in the file `trials.csv` in `folder`. A search that starts again tries the same
-    gains as before, and loads the results of finished trials from `folder`.
+    After an interruption, the file `trials.csv` in `folder` has the rows of the finished
+    trials. A search that starts again tries the same gains as before, and loads the results of
+    finished trials from `folder`.
 
     Parameters
     ----------
@@ -268,9 +268,9 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     count
         Number of trials.
     runs
-        Runs of each case in a trial.
+        Number of runs of each case in a trial.
     folder
-        Folder that `results_folder` yields.
+        Folder of the results.
     """
     import optuna
     import pandas as pd
@@ -312,12 +312,15 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
 def score(
     name: str, plant: Arguments, runs: int, first_run: int, gains: Mapping[str, float]
 ) -> dict[str, float]:
-    """Run a controller with some gains in all cases, and return numbers by name.
+    """Run a controller with the gains `gains` in all cases, and return the results by name.
 
-    The numbers are the gains; the median over runs of the mean error in each case, degC, by the
-    name of the case; "not converged", the share of runs that do not settle at the constant set
-    point; and "objective", degC, which the search minimises: the mean of the medians, plus a
-    penalty that is proportional to "not converged".
+    The results contain:
+
+    - the gains;
+    - the median over the runs of the mean error in each case, degC, by the name of the case;
+    - "not converged": the share of runs that do not settle at the constant set point;
+    - "objective": the mean of the medians, plus a penalty in proportion to "not converged",
+      degC. The search minimises the objective.
 
     Parameters
     ----------
@@ -326,7 +329,7 @@ def score(
     plant
         Arguments of the environment for the plant.
     runs
-        Runs of each case.
+        Number of runs of each case.
     first_run
         Seed of the first run of the first case.
     gains

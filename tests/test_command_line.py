@@ -82,14 +82,14 @@ REFUSED = {
     "identify": [
         (["none.csv"], "none.csv cannot be read: No such file"),
         ([LOG, "--u-min", "nan"], 'value "nan" for --u-min. Must be < inf'),
-        ([LOG, "--operating-flow", "1e9"], "operating_flow must be near the flows of the log"),
+        ([LOG, "--operating-flow", "1e9"], "--operating-flow must be near the flows"),
     ],
     "speed": [
         (["--device", "toaster"], "--device: device must be a device that PyTorch can use"),
     ],
     "sweep": [
         (["--design", "random", "--set", "a=[1]"], "--design random: time_constant_factor"),
-        (["--plants", "10"], "--plants and --design-seed are for --design random"),
+        (["--plants", "10"], "--plants and --design-seed need --design random"),
         (["--out", __file__], "cannot be written to: it is not a folder"),
     ],
     "tune": [

@@ -1,17 +1,22 @@
 """A recorded log becomes a plant, and a log that is not fit for it is refused or doubted."""
 
+import itertools
 import json
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import cache
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy import signal
 
-from benchmarks.identify import Options, doubts, main, plant_arguments, read_log
+from benchmarks.identify import Options, doubts, draw, main, plant_arguments, read_log
+from benchmarks.lib import pictures
 from benchmarks.lib.errors import UsageError
 from benchmarks.loop import identification
 from benchmarks.loop.identification import Log, estimates, explained_share
@@ -57,6 +62,11 @@ class TestFit:
         response = identification.respond(np.repeat([0.0, 1.0], [5, 55]), 16.3, 30.0, 11.0)
         np.testing.assert_allclose(response, 1.0 - remaining / 19.0, atol=1e-12)
 
+    def test_polynomials_of_small_reflection_coefficients_are_stable(self):
+        for first, second in itertools.product([-0.97, -0.5, 0.5, 0.97], repeat=2):
+            roots = np.roots(identification.stable_polynomial(first, second))
+            assert np.abs(roots).max() < 1.0, (first, second)
+
     def test_paper_plant_is_found_in_a_log_that_begins_with_a_step(self):
         truths = {"delay": 18, "dead_zone": 5.0, "gain": GAIN, "time_constant": 161.0}
         intervals = estimates(fit_of_paper())
@@ -93,6 +103,13 @@ class TestFit:
         assert fit.load_steps[0] == pytest.approx(650, abs=10)
         assert fit.unknowns.gain == pytest.approx(GAIN, rel=0.05)
 
+    def test_picture_names_the_steps_of_a_load_once(self, monkeypatch):
+        figure = Figure()
+        monkeypatch.setattr(pictures, "open_picture", lambda *_: nullcontext(figure))
+        draw(replace(fit_of_paper(), load_steps=(300, 700)), "title", Path("log.png"))
+        names = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+        assert names == ["recorded", "model", "step of a load"]
+
 
 def table(line="16,5,1", mark=".", start=0):
     """Return the text of a log whose line 4 is `line`, and whose other flows are 3.
@@ -127,10 +144,12 @@ WAYS = {
     "a missing row": table().replace("\n64,3,1.25", ""),
 }
 REFUSED = {
-    "line 4: flow looks like thousands: '1,480'": table('16,"1,480" ,1'),
-    "line 4: flow looks like thousands: '1.480'": table("16,1.480,1").replace(",", ";"),
-    "line 4: a time step of 11.6 s: most time steps are 8": table("19.6,5,1"),
-    "line 10: .* dates begin with the month, write .* 2025-12-31": (
+    "line 4: flow must not have separators of thousands, got '1,480'": table('16,"1,480" ,1'),
+    "line 4: flow must not have separators of thousands, got '1.480'": table(
+        "16,1.480,1"
+    ).replace(",", ";"),
+    "line 4 comes 11.6 s after the line before, but most time steps are 8": table("19.6,5,1"),
+    "line 10 comes .* dates begin with the month, write .* 2025-12-31": (
         dated("%m/%d/%Y %H:%M:%S", "01/02/2026 23:59:00")
     ),
 }

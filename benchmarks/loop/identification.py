@@ -1,16 +1,15 @@
 """Fit a plant with a dead zone, a delay and one or two lags to a log, with 95 % intervals.
 
-A log is a table of flows and temperatures, with one row a sample. The model of the temperature
-is the sum of three parts:
+A log is a table of flows and temperatures, with one row for each sample. The fitted model (a
+Box-Jenkins model) describes the temperature as the sum of three parts:
 
-- the flow response: the gain times the response of the delay and the lags to the flow behind
-  the dead zone;
+- the flow response: the output of a dead zone, a delay, one or two lags and a gain in series,
+  whose input is the flow;
 - the background: a constant, the decay of the plant's state at the first row, the responses to
   measured disturbances, and the responses to steps of unmeasured loads;
-- noise C(z^-1) / D(z^-1) xi, with the white noise xi and two polynomials C and D.
+- coloured noise C(z^-1) / D(z^-1) xi, with two polynomials C and D and the white noise xi.
 
-The fit minimises the sum of the squared prediction errors, which are estimates of the white
-noise xi (a Box-Jenkins model).
+The fit minimises the sum of the squared prediction errors, which are estimates of xi.
 """
 
 from dataclasses import dataclass, replace
@@ -26,29 +25,30 @@ from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 
-# A second lag, a dead zone and a load step become part of the model only if they improve the
-# fit by these values of `Fit.improvement`, because any part improves a fit a little by chance.
+# Smallest values of `Fit.improvement` for which the model gets a second lag, a dead zone or a
+# load step. The values are not 0, because every added part improves a fit a little by chance.
 IMPROVEMENT_BY_SECOND_LAG = 10.0
 IMPROVEMENT_BY_DEAD_ZONE = 9.0
-# This value is the largest, because the time of a step is chosen among hundreds of times.
+# A load step needs the largest improvement, as its row is chosen among hundreds of rows.
 IMPROVEMENT_BY_LOAD_STEP = 25.0
-MOST_LOAD_STEPS = 4  # in a model: with many steps, the model could fit any temperature
-# A 95 % interval is this number of standard errors wide on either side. Two standard errors
-# would be enough if a plant were exactly of the model's form. With three, the intervals of the
-# gain contained the true gain in at least 95 % of the logs of simulated plants.
+MOST_LOAD_STEPS = 4  # largest number in a model: many load steps could fit any temperature
+# Distance from an estimate to either end of its 95 % interval, in standard errors. Two standard
+# errors would be enough if the model could describe a plant exactly. With three, the intervals
+# of the gain contained the true gain in at least 95 % of the logs of simulated plants.
 INTERVAL = 3.0
-GRID_POINTS = 31  # number of centres, and number of half widths, of a dead zone that are tried
+GRID_POINTS = 31  # number of centres, and number of half widths, of the dead zones in a fit
 # The lags between a measured disturbance and the temperature are unknown. A weighted sum of the
 # step responses of three pairs of lags is close to nearly any smooth step response. Each pair
 # has the plant's larger time constant, and this time constant times one of the ratios.
 DISTURBANCE_RATIOS = 0.3, 0.9, 3.0
-# Terms of the background can be nearly equal, such as three responses to a slow disturbance.
-# Least squares ignores combinations of terms that are smaller than this share of the largest.
+# Smallest singular value in the least squares for `Fit.coefficients`, as a share of the largest
+# singular value. Columns of `Fit.background` can be nearly equal, such as the responses of
+# three pairs of lags to a slow disturbance.
 SMALLEST_COMBINATION = 1e-8
-MOST_BLOCKS = 2000  # blocks of rows in a fit; a fit to more blocks takes longer, with no gain
-# The filter that whitens the noise starts from zero. Before this filter has settled, in the
-# first blocks, the prediction errors are as large as the noise, so their weight is small. With
-# the weight 0, the fit would not determine the state of the plant at the first row.
+MOST_BLOCKS = 2000  # largest number of blocks of rows in a fit; more blocks only take longer
+# Number and weight of the first blocks. The filter that whitens the noise has not settled in
+# the first blocks, so the prediction errors are as large as the noise, and get a small
+# weight. With the weight 0, the fit would not determine the plant's state at the first row.
 SETTLING_BLOCKS = 10
 SETTLING_WEIGHT = 0.1
 TINY = 1e-30  # prevents divisions by zero
@@ -56,7 +56,7 @@ TINY = 1e-30  # prevents divisions by zero
 
 @dataclass(frozen=True)
 class Log:
-    """A log of a plant: a table with one row a sample, without missing values."""
+    """A log of a plant, with one row for each sample and without missing values."""
 
     flow: Array  # the flow commanded from the time of each row on, t/h, shape (rows,)
     temperature: Array  # the temperature at the time of each row, degC, shape (rows,)
@@ -65,23 +65,23 @@ class Log:
 
 
 class DeadZone(NamedTuple):
-    """A dead zone of a valve: an interval of flows that all act like the flow in its middle."""
+    """Dead zone of a valve: all flows in an interval act like the flow in the middle."""
 
     centre: float  # the middle of the interval, t/h
-    half_width: float = 0.0  # half of the interval's length, t/h; 0 for no dead zone
+    half_width: float = 0.0  # half of the length of the interval, t/h; 0 for no dead zone
 
     def passed(self, flow: Array) -> Array:
-        """Return the flow that acts on the plant when `flow` is commanded, both in t/h.
+        """Return the flows that act on the plant, t/h, if the flows `flow`, t/h, are commanded.
 
-        A flow inside the dead zone becomes the centre, as in equation (29) of the paper. The
-        result has the shape of `flow`.
+        A flow inside the dead zone is replaced by the centre of the dead zone, as in equation
+        (29) of the paper.
         """
         is_inside = np.abs(flow - self.centre) < self.half_width
         return np.where(is_inside, self.centre, flow)
 
 
 def respond(inputs: Array, delay: float, slow: float, fast: float = 0.0) -> Array:
-    """Return the output of a delay and one or two lags in series with gain 1.
+    """Return the output of a delay and one or two first-order lags in series, with gain 1.
 
     The result is exact for inputs that are constant from one row to the next and were 0 before
     the first row.
@@ -89,17 +89,17 @@ def respond(inputs: Array, delay: float, slow: float, fast: float = 0.0) -> Arra
     Parameters
     ----------
     inputs : array of shape (rows, ...)
-        Flows or other inputs, in any unit.
+        Flows or other input signals, in any unit.
     delay : float
-        The delay in samples, which need not be an integer.
+        Delay in samples, not necessarily an integer.
     slow, fast : float
-        The time constants of the two lags in samples; `fast` differs from `slow`, and is 0 for
+        Time constants of the two lags, in samples. `fast` must differ from `slow`, and is 0 for
         a single lag.
 
     Returns
     -------
     array of shape (rows, ...)
-        The outputs, in the unit of the inputs.
+        Output signals, in the unit of `inputs`.
     """
     if fast > 0.0:  # partial fractions
         slow_part = slow * respond(inputs, delay, slow)
@@ -108,8 +108,8 @@ def respond(inputs: Array, delay: float, slow: float, fast: float = 0.0) -> Arra
     whole_delay = int(delay)
     decay = np.exp(-1.0 / slow)
     state = lfilter([0.0, 1.0 - decay], [1.0, -decay], inputs, axis=0)
-    # A delayed input changes between two rows. From this change to the next row, the state
-    # decays for the part of a sample that is left.
+    # If the delay is not an integer, the delayed input changes between two rows. From the
+    # change to the next row, the state decays for a part of a sample.
     decay_to_row = np.exp(-(1.0 - (delay - whole_delay)) / slow)
     state_at_rows = decay_to_row * state + (1.0 - decay_to_row) * inputs
     response = np.zeros_like(inputs)
@@ -118,16 +118,16 @@ def respond(inputs: Array, delay: float, slow: float, fast: float = 0.0) -> Arra
 
 
 def stable_polynomial(first: float, second: float) -> Array:
-    """Return the coefficients (1, p, q) of a polynomial 1 + p z^-1 + q z^-2.
+    """Return (1, p, q), the coefficients of a polynomial 1 + p z^-1 + q z^-2.
 
-    `first` and `second` are the reflection coefficients of the polynomial. All roots z lie
-    inside the unit circle if both reflection coefficients are between -1 and 1.
+    `first` and `second` are the reflection coefficients of the polynomial. If both reflection
+    coefficients are between -1 and 1, all roots z of the polynomial lie inside the unit circle.
     """
     return np.array([1.0, first * (1.0 + second), second])
 
 
 class Unknowns(NamedTuple):
-    """The unknown parameters of the model that nonlinear least squares estimates."""
+    """The parameters of a model that the fit estimates by nonlinear least squares."""
 
     gain: float  # steady-state gain from flow to temperature, degC per t/h
     delay: float  # delay of the flow response, samples, not necessarily an integer
@@ -141,32 +141,31 @@ class Unknowns(NamedTuple):
 
     @property
     def slow(self) -> float:
-        """The larger time constant, samples."""
+        """The larger time constant of the two lags, samples."""
         return float(np.exp(self.log_slow))
 
     @property
     def fast(self) -> float:
-        """The smaller time constant, samples; 0 for a single lag."""
+        """The smaller time constant of two lags, samples; 0 for a single lag."""
         return self.ratio * self.slow
 
     def respond(self, flows: Array) -> Array:
-        """Return the output of the delay and the lags, with gain 1, for changes of some flows.
+        """Return the output of the delay and the lags, with gain 1, for `flows - flows[0]`.
 
-        A change is a flow minus the flow in the first row. `flows` and the result have the
-        shape (rows, ...).
+        `flows` and the result are in t/h and have the shape (rows, ...).
         """
         return respond(flows - flows[0], self.delay, self.slow, self.fast)
 
 
-# The limits between which `Fit.refined` looks for each unknown. The upper limits of the delay
-# and the time constant depend on the length of the log, and are set in `Fit.refined`.
+# Lower and upper limits of the parameters in `Fit.refined`, which sets the upper limits of the
+# delay and of the larger time constant from the length of the log.
 LOWEST = Unknowns(-np.inf, 0.0, np.log(0.25), -0.98, -0.98, -0.999, -0.999, 0.02)
 HIGHEST = Unknowns(np.inf, np.inf, np.inf, 0.98, 0.98, 0.999, 0.999, 0.97)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A model that is fitted to a log.
+    """A model of a plant, fitted to a log.
 
     The rows from `first_row` to `end_row` are divided into blocks of successive rows, and the
     model is fitted to the mean of each block. In a log of fewer than `MOST_BLOCKS` rows, each
@@ -175,20 +174,22 @@ class Fit:
 
     log: Log
     zones: list[DeadZone]  # the dead zones to choose from, those of half width 0 first
-    unknowns: Unknowns  # the estimates of gain, delay, time constants and noise model
+    unknowns: Unknowns  # the values of gain, delay, time constants and noise model
     zone: DeadZone  # the dead zone of the model
-    load_steps: tuple[int, ...] = ()  # the rows at which an unmeasured load steps
-    # The first row that is fitted. Earlier temperatures depend on flows from before the log.
+    load_steps: tuple[int, ...] = ()  # the rows in which an unmeasured load has a step
+    # The first row that is fitted. The temperatures in the rows before `first_row` depend on
+    # flows from before the log.
     first_row: int = 0
-    end_row: int | None = None  # the row behind the last one that is fitted; None for all rows
-    standard_errors: Unknowns | None = None  # of each unknown, after `refined`
+    end_row: int | None = None  # the row after the last fitted row; None for all rows
+    # Standard error of each parameter in `unknowns`; None if `refined` was not called.
+    standard_errors: Unknowns | None = None
 
     def whiten(self, signals: Array) -> Array:
-        """Return the means of signals over blocks of rows, filtered by D / C.
+        """Return the means of signals over blocks of successive rows, filtered by D / C.
 
-        The filter D / C turns noise of the noise model C / D into white noise. `signals` has
-        the shape (rows, ...), and the result has the shape (blocks, ...). The first
-        `SETTLING_BLOCKS` blocks are multiplied by a small weight.
+        The filter D / C turns noise of the noise model C / D into white noise. The result is
+        multiplied by `SETTLING_WEIGHT` in the first `SETTLING_BLOCKS` blocks. `signals` has the
+        shape (rows, ...), and the result has the shape (blocks, ...).
         """
         unknowns = self.unknowns
         c = stable_polynomial(unknowns.first_of_c, unknowns.second_of_c)
@@ -204,15 +205,15 @@ class Fit:
 
     @cached_property
     def flow_response(self) -> Array:
-        """The effect of the flow's changes on the temperature, degC, shape (rows,)."""
+        """The change of the temperature that the flow causes, degC, shape (rows,)."""
         return self.unknowns.gain * self.unknowns.respond(self.zone.passed(self.log.flow))
 
     @cached_property
     def background(self) -> Array:
-        """The terms of the background before they are multiplied by `coefficients`.
+        """Signals whose weighted sum is the temperature without noise and flow response.
 
-        The shape is (rows, terms). The background is the part of the temperature that is
-        neither noise nor an effect of the flow's changes. The first term is the constant 1.
+        The weights are `coefficients`. The array has the shape (rows, terms), and the first
+        column is 1 in all rows.
         """
         slow, fast = self.unknowns.slow, self.unknowns.fast
         rows = np.arange(len(self.log.flow), dtype=np.float64)
@@ -231,7 +232,7 @@ class Fit:
 
     @cached_property
     def coefficients(self) -> Array:
-        """The factors of the background's terms, by linear least squares, shape (terms,)."""
+        """Weights of the columns of `background`, by linear least squares, shape (terms,)."""
         terms = self.whiten(self.background)
         target = self.whiten(self.log.temperature - self.flow_response)
         lengths = np.linalg.norm(terms, axis=0) + TINY
@@ -240,19 +241,20 @@ class Fit:
 
     @cached_property
     def simulated(self) -> Array:
-        """The temperature of the model in each row of the log, without noise, degC, (rows,)."""
+        """The temperature that the model simulates without noise, degC, shape (rows,)."""
         return np.asarray(self.background @ self.coefficients + self.flow_response)
 
     @cached_property
     def errors(self) -> Array:
-        """The prediction error of each block of rows, degC, shape (blocks,)."""
+        """The prediction error of each block of successive rows, degC, shape (blocks,)."""
         return self.whiten(self.log.temperature - self.simulated)
 
     @property
     def operating_temperature(self) -> float:
         """The steady temperature of the model if the flow is the centre of the dead zone, degC.
 
-        Loads and measured disturbances are taken to have the values of the first row.
+        The loads and the measured disturbances are assumed to have the values of the first row
+        of the log.
         """
         first_flow = self.zone.passed(self.log.flow[:1])[0]
         change = self.unknowns.gain * (self.zone.centre - first_flow)
@@ -264,46 +266,47 @@ class Fit:
         return float(self.errors @ self.errors + TINY)
 
     def improvement(self, squares: Array | float) -> Array:
-        """Return by how much other fits are better than this fit; negative if they are worse.
+        """Return by how much other fits are better than this fit; a negative value is worse.
 
-        The improvement is twice the logarithm of a ratio: the likelihood of the other fit,
-        divided by the likelihood of this fit. `squares` has the sum of squared prediction
-        errors of each other fit, degC^2, and the result has the shape of `squares`.
+        The value is twice the logarithm of a ratio: the likelihood of another fit divided by
+        the likelihood of this fit. `squares` has the sums of squared prediction errors of the
+        other fits, degC^2, and the result has the shape of `squares`.
         """
         return np.asarray(len(self.errors) * np.log(self.squares / (squares + TINY)))
 
     def try_candidates(self, target: Array, candidates: Array) -> tuple[Array, Array]:
-        """Fit the background and a multiple of one candidate to a signal, for each candidate.
+        """Fit a signal by a weighted sum of `background` and one candidate, for each candidate.
 
-        `target` is the signal, degC, shape (rows,). `candidates` are signals in any unit, shape
-        (rows, candidates). The results are the sums of the squared prediction errors, degC^2,
-        and the factors of the candidates, degC per unit, both of shape (candidates,).
+        `target` is the signal, degC, shape (rows,). `candidates` has a candidate in each
+        column, in any unit, shape (rows, candidates). Two arrays of shape (candidates,) are
+        returned: the sums of the squared prediction errors, degC^2, and the factors of the
+        candidates, degC per unit.
         """
-        # Regress the target and the candidates on the background. What the background does not
-        # explain of the target is then fitted by what it does not explain of a candidate.
+        # Regress the target and the candidates on the columns of `background`. The residual of
+        # the target is then fitted by the residual of one candidate.
         base = self.whiten(self.background)
         orthonormal = qr(base / (np.linalg.norm(base, axis=0) + TINY), mode="economic")[0]
         whitened = self.whiten(np.column_stack([target, candidates]))
         unexplained = whitened - orthonormal @ (orthonormal.T @ whitened)
         errors, terms = unexplained[:, 0], unexplained[:, 1:]
         powers = np.sum(terms**2, axis=0)
-        # A candidate that is a weighted sum of terms of the background cannot improve the fit.
+        # A candidate that is a weighted sum of columns of `background` cannot improve the fit.
         powers[powers <= 1e-10 * np.sum(whitened[:, 1:] ** 2, axis=0)] = np.inf
         products = terms.T @ errors
         return errors @ errors - products**2 / powers, products / powers
 
     def refined(self, evaluations: int = 25) -> "Fit":
-        """Return this fit after nonlinear least squares, which improves all unknowns together.
+        """Return this fit with `unknowns` improved by nonlinear least squares.
 
-        The search starts from the unknowns of this fit and finds a local minimum of the sum of
-        squared prediction errors. The result also has `standard_errors`. `evaluations` is the
-        largest number of steps that the search may try.
+        The search starts from the values in `unknowns`, and finds a local minimum of the sum of
+        squared prediction errors. The returned fit has `standard_errors`. `evaluations` is the
+        largest number of steps of the search.
         """
         longest_delay = len(self.log.flow) / 6.0
         highest = HIGHEST._replace(delay=longest_delay, log_slow=np.log(2.0 * longest_delay))
         limits = np.array([LOWEST, highest])
         start = np.array(self.unknowns)
-        if self.unknowns.ratio == 0.0:  # A single lag has no ratio, the last of the unknowns.
+        if self.unknowns.ratio == 0.0:  # A single lag has no ratio, the last parameter.
             limits, start = limits[:, :-1], start[:-1]
 
         def errors(values: Array) -> Array:
@@ -319,7 +322,7 @@ class Fit:
             xtol=1e-5,
             max_nfev=evaluations,
         )
-        # With the Jacobian J, the covariance of the unknowns is the inverse of J' J times the
+        # With the Jacobian J, the covariance of the estimates is the inverse of J' J times the
         # variance of the errors. The lengths of the rows of the pseudo-inverse of J are the
         # square roots of the diagonal of the inverse of J' J.
         lengths = np.linalg.norm(np.linalg.pinv(result.jac), axis=1)
@@ -332,11 +335,12 @@ class Fit:
 def possible_zones(
     flow: Array, operating_flow: float | None = None, *, applied: bool = False
 ) -> list[DeadZone]:
-    """Return the dead zones that the valve of a log may have, those of half width 0 first.
+    """Return the dead zones that a fit to a log tries, sorted by half width from 0 on.
 
-    `flow` is the flow of the log, t/h, shape (rows,). `operating_flow` is the centre of the
-    dead zone, t/h; if it is None, the result has centres in the whole range of the flow. If
-    `applied` is true, the flow was measured behind the valve, and all half widths are 0.
+    `flow` is the flow of the log, t/h, shape (rows,). `operating_flow` is the centre of all
+    dead zones, t/h; if `operating_flow` is None, the centres lie in the whole range of the
+    flow. If `applied` is true, the flow was measured behind the valve, and all half widths
+    are 0.
     """
     centres = np.linspace(flow.min(), flow.max(), GRID_POINTS)
     if operating_flow is not None:
@@ -345,7 +349,7 @@ def possible_zones(
     half_widths = np.linspace(0.0, widest, GRID_POINTS)
     # Flows that differ by less than 2 % of their range count as equal.
     levels = np.unique(np.round(50.0 * (flow - flow.min()) / np.ptp(flow)))
-    if len(levels) < 3:  # Two different flows cannot show how wide the dead zone is.
+    if len(levels) < 3:  # From two different flows, no fit can find the half width.
         half_widths = np.array([0.0, widest])
     if applied:
         half_widths = np.zeros(1)
@@ -357,40 +361,42 @@ def possible_zones(
 def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
     """Return a first fit of the model to a log, without a dead zone and with one lag.
 
-    The fit is the best of a grid of delays and time constants. `log`, `zones` and `end_row` are
-    the arguments of `identify`.
+    The result is the best of several searches, which start from different time constants.
+    `log`, `zones` and `end_row` are the arguments of `identify`.
     """
     rows = len(log.flow)
     changes = log.flow - log.flow[0]
     delays = np.unique(np.geomspace(1.0, rows / 6.0, 30).round()) - 1.0
     fits = []
-    for slow in np.geomspace(max(1.0, rows / 2000.0), rows / 8.0, 6):
-        # The noise often has the time constant of the plant, so the search begins with it.
+    time_constants = np.geomspace(max(1.0, rows / 2000.0), rows / 8.0, 6)  # samples
+    for slow in time_constants:
+        # The noise often has the time constant of the plant. The search therefore starts with
+        # D = 1 - exp(-1 / slow) z^-1, which has the root exp(-1 / slow).
         start = Unknowns(0.0, 0.0, np.log(slow), first_of_d=-np.exp(-1.0 / slow))
-        fit = Fit(log, zones, start, zones[0], end_row=end_row)
+        without_dead_zone = zones[0]  # The first dead zone has the half width 0.
+        fit = Fit(log, zones, start, without_dead_zone, end_row=end_row)
         responses = [respond(changes, delay, slow) for delay in delays.tolist()]
         squares, gains = fit.try_candidates(log.temperature, np.column_stack(responses))
         best = int(np.argmin(squares))
         start = start._replace(gain=float(gains[best]), delay=float(delays[best]))
         fits.append(replace(fit, unknowns=start).refined(12))
     fit = min(fits, key=lambda fit: fit.squares)
-    # After the delay, the temperature depends on the flows in the log. The margin allows for
-    # errors of the first fit.
+    # Temperatures during the delay depend on flows from before the log. The first fitted row is
+    # later than the delay by a margin, because the delay of the first fit is not exact.
     first_row = int(1.3 * fit.unknowns.delay + fit.unknowns.slow / 4.0) + 3
     return replace(fit, first_row=min(first_row, rows // 6))
 
 
 def try_zones(fit: Fit) -> pd.DataFrame:
-    """Return a table of fits with other dead zones, one row for each dead zone in `fit.zones`.
+    """Return a table of fits like `fit`, one row for each dead zone in `fit.zones`.
 
-    Gain and background are fitted anew for each dead zone, and all other parts of the model are
-    those of `fit`. The columns of the table are `centre` and `half_width` of the dead zone
-    (t/h), the new `gain` (degC per t/h), and `improvement`, which is the improvement over `fit`
-    as `Fit.improvement` defines it.
+    For each dead zone, only the gain and `Fit.coefficients` are fitted again. The columns of
+    the table are `centre` and `half_width` of the dead zone (t/h), the new `gain` (degC per
+    t/h), and `improvement`, which is the result of `Fit.improvement` for the new fit.
     """
     passed = np.column_stack([zone.passed(fit.log.flow) for zone in fit.zones])
-    responses = fit.unknowns.respond(passed)
-    squares, gains = fit.try_candidates(fit.log.temperature, responses)
+    responses_with_gain_1 = fit.unknowns.respond(passed)
+    squares, gains = fit.try_candidates(fit.log.temperature, responses_with_gain_1)
     table = pd.DataFrame(fit.zones)
     return table.assign(gain=gains, improvement=fit.improvement(squares))
 
@@ -399,7 +405,8 @@ def with_zone(fit: Fit) -> Fit:
     """Return `fit` with a new dead zone: the mean of the likeliest dead zones in `fit.zones`.
 
     If no dead zone improves a fit without a dead zone by `IMPROVEMENT_BY_DEAD_ZONE`, the half
-    width of the new dead zone is 0. The other unknowns are not changed.
+    width of the new dead zone is 0. The gain, the delay, the time constants and the noise model
+    are not changed.
     """
     table = try_zones(fit)
     most = table.improvement.max()
@@ -412,9 +419,10 @@ def with_zone(fit: Fit) -> Fit:
 
 
 def with_lags(fit: Fit) -> Fit:
-    """Return `fit`, refined with two lags, or with one lag if two lags are hardly better.
+    """Return `fit`, refined with one lag, or with two lags if two lags are clearly better.
 
-    Two lags are hardly better if the improvement is at most `IMPROVEMENT_BY_SECOND_LAG`.
+    The second lag must improve the fit (`Fit.improvement`) by more than
+    `IMPROVEMENT_BY_SECOND_LAG`.
     """
     single = replace(fit, unknowns=fit.unknowns._replace(ratio=0.0)).refined()
     # In a model with two lags, the second lag replaces a part of the delay of one lag.
@@ -426,8 +434,8 @@ def with_lags(fit: Fit) -> Fit:
 def with_load_steps(fit: Fit) -> Fit:
     """Return `fit` with new steps of unmeasured loads, which replace the load steps of `fit`.
 
-    Up to `MOST_LOAD_STEPS` steps are added one by one. Each added step is the step that
-    improves the fit most, and its improvement is at least `IMPROVEMENT_BY_LOAD_STEP`.
+    Up to `MOST_LOAD_STEPS` load steps are added one by one, always the step that improves the
+    fit most. A load step is added only if it improves the fit by `IMPROVEMENT_BY_LOAD_STEP`.
     """
     fit = replace(fit, load_steps=())
     slow = fit.unknowns.slow
@@ -447,11 +455,11 @@ def with_load_steps(fit: Fit) -> Fit:
 
 
 def identify(log: Log, zones: list[DeadZone], end_row: int | None = None) -> Fit:
-    """Identify the plant of a log: return the best fit of the model to the log.
+    """Return the best fit of a plant model to a log.
 
-    The plant need not be at rest in the first row. `zones` are the dead zones to choose from,
-    as `possible_zones` returns them. The model is fitted to the rows before `end_row`, or to
-    all rows if `end_row` is None.
+    The plant need not be at rest in the first row of the log. `zones` is a list of dead zones
+    to choose from, a result of `possible_zones`. The model is fitted to the rows before
+    `end_row`, or to all rows if `end_row` is None.
     """
     fit = first_fit(log, zones, end_row)
     for _ in range(2):  # because the best dead zone depends on the lags and vice versa
@@ -463,12 +471,12 @@ def estimates(fit: Fit) -> pd.DataFrame:
     """Return a table of the plant's estimated parameters with 95 % confidence intervals.
 
     The rows are `delay` (samples), `dead_zone` (the half width, t/h), `gain` (degC per t/h) and
-    `time_constant` (the larger one, s). The columns are `value` and the ends of the interval,
-    `low` and `high`. `fit` must be a result of `Fit.refined` or `identify`.
+    `time_constant` (the larger time constant, s). The columns are `value` and the ends of the
+    interval, `low` and `high`. `fit` must be a result of `Fit.refined` or `identify`.
     """
     values = fit.unknowns
     margins = Unknowns(*(INTERVAL * np.array(fit.standard_errors)))
-    delay_margin = margins.delay + 0.5  # A log may be half a sample early or late.
+    delay_margin = margins.delay + 0.5  # Recorded times may be half a sample late.
     # An improvement that is smaller by z^2 corresponds to a distance of z standard errors.
     table = try_zones(fit)
     likely = table[table.improvement > table.improvement.max() - INTERVAL**2]
@@ -494,10 +502,10 @@ def estimates(fit: Fit) -> pd.DataFrame:
 def explained_share(fit: Fit) -> float:
     """Return how well a model of the first two thirds of a log predicts the last third.
 
-    A new model is fitted to the first two thirds of the log of `fit`. The new model simulates
-    the temperature in the last third from the flow and the measured disturbances. The result is
-    the share of the variance of the temperature in the last third that the simulation explains:
-    1 for a perfect simulation, and below 0 for a simulation that is worse than a constant.
+    A model that is fitted to the first two thirds of the log simulates the temperature in the
+    last third from the flow and the measured disturbances. The result is the share of the
+    variance of the temperature in the last third that the simulation explains: 1 for a perfect
+    simulation, and below 0 for a simulation that is worse than a constant.
     """
     end_row = 2 * len(fit.log.flow) // 3
     earlier = identify(fit.log, fit.zones, end_row)
@@ -506,15 +514,15 @@ def explained_share(fit: Fit) -> float:
 
 
 def polynomials(fit: Fit, delay: int) -> tuple[Array, Array, Array, float]:
-    """Return the polynomials A, B, C of equation (28) of the paper, and the variance of xi.
+    """Return the polynomials A, B, C of equation (28), and the variance of xi, degC^2.
 
-    A and C have their coefficients from z^0 on. B has its coefficients from z^-1 on, in degC
-    per t/h. The variance of the white noise xi is in degC^2.
+    The arrays A and C begin with the coefficient of z^0. The array B begins with the
+    coefficient of z^-1, in degC per t/h. `delay` is the delay of equation (28), samples.
 
-    With a delay of `delay` samples, A and B reproduce the flow response of the fit exactly if
-    the delay of the fit is at least `delay` samples and at most one sample longer. If the delay
-    of the fit is shorter, B leaves out the response before the sample `delay + 1`. C and xi
-    give noise that resembles the noise of the log.
+    If the delay of the fit is from `delay` to `delay + 1`, A and B reproduce the flow response
+    of the fit exactly. If the delay of the fit is shorter than `delay`, B leaves out the
+    response before the sample `delay + 1`. C and the variance of xi are fitted to the recorded
+    temperature minus the simulated temperature.
     """
     unknowns = fit.unknowns
     lags = np.array([unknowns.slow, unknowns.fast])

@@ -1,6 +1,6 @@
 """Define the cases of comparisons, the options that choose a plant, and random plants.
 
-A case (a scenario in the code) is a plant, a set point and a length of the runs.
+A case, or scenario, consists of a plant, a set point and a length of the runs.
 """
 
 import json
@@ -23,19 +23,19 @@ Arguments = dict[str, Any]  # keyword arguments of the environment `MiddlePoint-
 
 @dataclass(frozen=True)
 class Scenario:
-    """A case: a plant, a set point and a length of the runs.
+    """A case of a comparison: a plant, a set point and a length of the runs.
 
     Attributes
     ----------
     name : str
-        The name of the case in options and files.
+        Name of the case in options and files.
     title : str
-        The name of the case in reports and pictures.
+        Name of the case in reports and pictures.
     samples : int
         Length of a run, in samples.
     arguments : dict
-        The arguments of the environment that define the plant and the set point. All other
-        arguments have their defaults.
+        Arguments of the environment that differ from the defaults, for the plant and the set
+        point.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Scenario:
 
     @property
     def parameters(self) -> Parameters:
-        """All arguments of the environment, those with default values included."""
+        """All arguments of the environment for this case, with the defaults filled in."""
         return Parameters(**self.arguments)
 
 
@@ -53,11 +53,11 @@ SETPOINTS = (
     Scenario("square", "square wave", 1200, {}),
     Scenario("constant", "constant set point", 600, {"setpoint": 5.0}),
 )
-"""The set points of the paper's cases, on the environment's default plant.
+"""The set points of the paper's cases, with the environment's default plant.
 
-Only the figures of the paper show set points. Two set points are used here: the environment's
-square wave, which is +5 degC for 300 samples and -5 degC for the next 300 samples, over two
-periods; and a constant set point of 5 degC.
+The paper shows set points only in figures. The set points here are a square wave, which is
++5 degC for 300 samples and -5 degC for the next 300 samples, over two periods, and a constant
+set point of 5 degC.
 """
 
 _CONSTANT = SETPOINTS[1].arguments
@@ -117,25 +117,25 @@ PRESET_SCENARIOS = {
 @options
 @dataclass(frozen=True, kw_only=True)
 class PlantOptions:
-    """Options that choose the plant: by a file, a preset or single arguments."""
+    """Options that choose the plant by a file, by a preset or by single arguments."""
 
     plant: Path | None = None
     """JSON file with arguments of the environment, such as the plant.json that
     benchmarks.identify writes."""
     preset: Annotated[str | None, Parameter(choices=PRESETS)] = None
-    """A plant that comes with the environment."""
+    """Name of a plant that the environment defines, such as hard."""
     set: tuple[str, ...] = ()
     """An argument of the environment, such as delay=30 or delay=[12,24] (repeatable;
     overrides --plant, which overrides --preset)."""
 
     @property
     def name(self) -> str:
-        """Short description of the chosen plant; "" if no option chooses a plant."""
+        """Description of the chosen plant, such as "hard, delay=30"; "" if none is chosen."""
         file = self.plant.stem if self.plant else None
         return ", ".join(filter(None, [self.preset, file, *self.set]))
 
-    def words(self) -> list[str]:
-        """Return the words of a command line, such as "--preset", "hard", for these options."""
+    def command_line(self) -> list[str]:
+        """Return the words of a command line that choose this plant: "--preset", "hard"."""
         words: list[str] = []
         if self.preset:
             words += ["--preset", self.preset]
@@ -148,9 +148,9 @@ class PlantOptions:
     def cases(self, default: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
         """Return the cases of the chosen plant by name, or `default` if no plant is chosen.
 
-        There is one case for each of the `SETPOINTS`, called "square" and "constant". But if
-        the user's arguments of the plant define a set point, there is one case with this set
-        point, called "run".
+        The cases are "square" and "constant", with the set points in `SETPOINTS`. If the user's
+        arguments of the plant define a set point, the only case is "run", with the user's set
+        point.
         """
         arguments = self.arguments()
         if not self.name:
@@ -166,10 +166,10 @@ class PlantOptions:
         return cases
 
     def arguments(self) -> Arguments:
-        """Return the arguments of the environment that the user has chosen.
+        """Return the arguments of the environment that --preset, --plant and --set choose.
 
-        A `UsageError` names the option if an argument of the environment is unknown or invalid,
-        or if the plant is unstable.
+        A `UsageError` is raised if an argument is unknown or invalid, or if the plant is
+        unstable.
         """
         arguments: Arguments = {}
         if self.preset:
@@ -179,7 +179,9 @@ class PlantOptions:
         for text in self.set:
             name, equals, value = text.partition("=")
             if not (name and equals):
-                raise UsageError(f"--set must be ARGUMENT=VALUE, got {text!r}")
+                raise UsageError(
+                    f"--set must be ARGUMENT=VALUE, such as delay=30, got {text!r}"
+                )
             arguments[name] = value  # a bare word, such as random
             with suppress(ValueError):
                 arguments[name] = json.loads(value)
@@ -188,8 +190,8 @@ class PlantOptions:
             a = Parameters.of_environment(arguments).a
             if abs(slowest_pole(a) or 0.0) > 1.0:
                 raise ValueError(
-                    "a must not have a root beyond the unit circle, as no controller of this "
-                    f"checkout holds such a plant, got {list(a)}"
+                    "a must not have a root beyond the unit circle, because none of the "
+                    f"controllers can stabilise such a plant, got {list(a)}"
                 )
         except (TypeError, ValueError) as error:  # A TypeError names an unknown argument.
             raise UsageError(f"{', '.join(options)}: {error}") from error
@@ -197,7 +199,10 @@ class PlantOptions:
 
 
 def _read_plant(file: Path) -> Arguments:
-    """Return the arguments of the environment in a JSON file, the value of `--plant`."""
+    """Return the arguments of the environment in a JSON file that `--plant` names.
+
+    A `UsageError` is raised if the file cannot be read, or does not contain a mapping.
+    """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         return dict(**content)  # a TypeError if `content` is no mapping
@@ -206,8 +211,8 @@ def _read_plant(file: Path) -> Arguments:
         raise UsageError(f"--plant: {file} must be {allowed}: {error}") from error
 
 
-# Ranges of the random plants that `random_design` returns, by argument of the environment. With
-# a gain factor below 0.74, the largest flow could not keep the temperature at 5 degC.
+# Ranges of the arguments of the plants that `random_design` returns, by name. With a gain
+# factor below 0.74, the largest flow could not hold the temperature at 5 degC.
 SPANS = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),
@@ -220,13 +225,13 @@ DRIFTS = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_dr
 
 
 def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
-    """Return `count` random plants: for each, the values of its arguments, drawn from `SPANS`.
+    """Return the arguments of `count` random plants: a Latin hypercube in the ranges `SPANS`.
 
-    The values form a Latin hypercube with the seed `seed`. The second half of the plants drift:
-    the factors of gain and time constant change, over `samples` samples, to other values within
-    `SPANS`.
+    In the second half of the plants, the gain factor and the time constant factor drift over
+    `samples` samples to other values in the ranges `SPANS`. `seed` is the seed of the Latin
+    hypercube.
     """
-    from scipy.stats.qmc import LatinHypercube  # here: slow to import
+    from scipy.stats.qmc import LatinHypercube  # imported here, as it is slow
 
     # A plant's row has the values of all arguments, and then the factors at the end of a drift.
     spans = [*SPANS.values(), *(SPANS[factor] for factor in DRIFTS)]
@@ -250,12 +255,12 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
     """Convert variations of the paper's plant to variations of another plant.
 
     If a variation has twice the delay of the paper's plant, then the returned variation has
-    twice the delay of the other plant. Dead zone, gain factor and time constant factor are
-    scaled in the same way. The noise variance is scaled with the square of the temperature
-    change that the flow can cause. All other arguments keep their values.
+    twice the delay of the other plant. Dead zones, gain factors and time constant factors are
+    scaled in proportion to the values of the two plants. Noise variances are scaled in
+    proportion to the square of the temperature change by half the range of the flow.
 
-    `nominal_plant` has the environment's arguments for the other plant. A variation has the
-    arguments that differ from the nominal plant.
+    `nominal_plant` has the environment's arguments for the other plant. A variation is a dict
+    of the arguments of the environment that differ from a nominal plant.
     """
     scales = _scales(Parameters(**nominal_plant))
     paper_scales = _scales(Parameters())
@@ -271,13 +276,14 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
 
 
 def _scales(plant: Parameters) -> dict[str, float]:
-    """Return a plant's value of each argument in `SPANS`, with which `around` scales.
+    """Return the scale of a plant for each argument in `SPANS`: the value of the argument.
 
-    If an argument of the plant has a range, the value is the middle of the range. In place of
-    the noise variance, which may be 0, the result has the square of the temperature change by
-    half the range of the flow, degC^2.
+    If an argument of the plant is a range, the scale is the middle of the range. The scale of
+    the noise variance is the square of the temperature change by half the range of the flow,
+    degC^2, because the noise variance of a plant may be 0.
     """
     model = nominal(plant)
-    reach = float(model.gain) * (model.numbers.u_max - model.numbers.u_min) / 2.0  # degC
-    scales = {**vars(model.numbers), "noise_variance": reach**2}
+    flow_change = (model.numbers.u_max - model.numbers.u_min) / 2.0  # t/h
+    temperature_change = float(model.gain) * flow_change  # degC
+    scales = {**vars(model.numbers), "noise_variance": temperature_change**2}
     return {name: float(scales[name]) for name in SPANS}
