@@ -172,7 +172,7 @@ def finding(rows: pd.DataFrame) -> str:
     """Return the picture's title, which compares errors and valve travels in noise.
 
     The title compares the controllers with the least and the most valve travel at an Ms of
-    `ROBUSTNESS`. `rows` is the argument of `draw`.
+    `ROBUSTNESS`. `rows` is a table like the argument `rows` of `draw`.
     """
     noisy = rows[(rows["Ms"] == ROBUSTNESS) & (rows["case"] == "square-noise")]
     ordered = noisy.sort_values("travel")

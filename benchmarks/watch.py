@@ -32,8 +32,8 @@ class Options:
     agent: str = "nn"
     """The controller: a name as in `compare`, or your own controller, NAME=MODULE:FACTORY."""
     scenario: str | None = None
-    """The case to run, as in `compare`. On a plant of your own, the cases are square and
-    constant, or run if the plant has a set point (default: the first case)."""
+    """The case to run, as in `compare`. The cases on a plant of your own are square and
+    constant, or the single case run if the plant has a set point (default: the first case)."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     seed: Seed = 0
     """The seed of the noise and of the controller's initial weights."""
@@ -71,7 +71,7 @@ def work(options: Options) -> str:
 
 
 def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed: int) -> None:
-    """Write a film of a run to the GIF file `path`; the other arguments are those of `frames`.
+    """Write a film of the first run in `trajectory` to the GIF file `path`.
 
     An existing file `path` is replaced only when the new film is complete.
     """
@@ -107,7 +107,7 @@ def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterat
     """
     from PIL import Image
 
-    from mptc_gym.environments.drawing import frame  # imported here, as it needs pygame
+    from mptc_gym.environments.drawing import frame  # imported here, as the module needs pygame
     from mptc_gym.environments.record import Record
 
     drawn = drawn_numbers(parameters, 1, seed)

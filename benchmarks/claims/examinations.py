@@ -2,7 +2,7 @@
 
 The paper is that of Cui and Shin (1992), whose controller is a neural network (NN) that learns
 online. Each function that takes a `Batch` and returns `Findings` examines one claim, or two
-similar claims. The module `benchmarks.claims.claims` states the claims in words.
+similar claims.
 """
 
 import itertools
@@ -33,8 +33,8 @@ RUN_LENGTH = 1200  # samples, unless the case has another length
 LEARNING_LENGTH = 600  # samples after which a network counts as trained
 WITH_NOISE = PRESETS["noisy"]
 NOISY_SQUARE_TITLE = "square wave, R = 0.5 °C²"
-# The cases of the set point. The constant set point comes first: without later changes, its
-# error comes from initial learning alone.
+# Cases with different set points. The case with a constant set point comes first, as the error
+# in this case comes from initial learning alone.
 SETPOINTS = PAPER_SETPOINTS[::-1]
 CONSTANT_SETPOINT, SQUARE_WAVE = (setpoint.arguments for setpoint in SETPOINTS)
 # Words for the learning rates ("gains") of a network with more nodes or inputs than the paper's
@@ -169,7 +169,7 @@ def best_lower_gain(batch: Batch, title: str, arguments: Arguments) -> Finding:
     return judge(
         f"mean error with the best lower Kp ({LOWER_PI[best]['kp']:.1f}) as a multiple of "
         f"the error with {PAPER_PI['kp']:g}, {title}",
-        (errors[best] / paper_errors).squeeze(),  # one exact number without noise
+        (errors[best] / paper_errors).squeeze(),  # Without noise, each array has one number.
         at_least=1 - NOTABLE_CHANGE,
     )
 
@@ -235,9 +235,9 @@ def wrong_direction(batch: Batch) -> Findings:
 def other_shapes(batch: Batch, shapes: Mapping[str, dict[str, int]]) -> Findings:
     """Compare networks with more nodes or inputs with the paper's network.
 
-    `shapes` has the argument `nodes` or `length` of `Batch.networks` for each kind of network,
-    by the title of the kind in the report. Each kind of network runs with the paper's learning
-    rates, and with smaller learning rates (the argument `in_proportion` of `Batch.networks`).
+    `shapes` gives, for the title of each kind of network in the report, the argument `nodes` or
+    `length` of `Batch.networks`. Each kind of network runs with the paper's learning rates, and
+    with smaller learning rates (the argument `in_proportion` of `Batch.networks`).
     """
     noisy_square = Scenario("noisy-square", NOISY_SQUARE_TITLE, RUN_LENGTH, WITH_NOISE)
     for case in (*SETPOINTS, noisy_square):
@@ -290,8 +290,8 @@ def reliability(batch: Batch) -> Findings:
 def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None:
     """Damage the first hidden node of each network at the sample k = `LEARNING_LENGTH`.
 
-    A rollout calls this function before each sample. After the damage, the output of the
-    damaged node is always `stuck_at`, which is 0 or 1. All undamaged nodes continue to learn.
+    At any other sample, nothing happens. After the damage, the output of the damaged node is
+    always `stuck_at`, which is 0 or 1. All undamaged nodes continue to learn.
     """
     if k != LEARNING_LENGTH:
         return
@@ -306,8 +306,8 @@ def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None
 def keep_learning(batch: Batch) -> Findings:
     """Compare learning and frozen networks on plants that differ from the training plant.
 
-    The networks first learn on the paper's plant. Then the gain or the delay of the plant
-    changes, and the weights of the networks either continue to learn or are frozen.
+    The networks first learn on the paper's plant. After this training, the gain or the delay of
+    the plant changes, and the weights of the networks either continue to learn or are frozen.
     """
     networks = batch.networks()
     batch.run(networks, RUN_LENGTH, **SQUARE_WAVE)
@@ -341,13 +341,12 @@ def keep_learning(batch: Batch) -> Findings:
 
 
 def direction_only(batch: Batch) -> Findings:
-    """Measure the share of runs that settle when the paper's network controls other plants.
+    """Measure how often the paper's network settles on plants with other parameter values.
 
-    The plants differ from the paper's plant in delay, gain and time constant. The steady flow
-    for a set point of 5 degC lies beyond the actuator's limits if the gain is below 0.74 of the
-    paper's gain, and inside the dead zone if the gain is above 1.46 of the paper's gain. Hence
-    two series of runs are made: with a set point of 5 degC for all plants, and with a set point
-    of 5 degC times the gain factor of the plant.
+    The steady flow for a set point of 5 degC lies beyond the actuator's limits if the gain is
+    below 0.74 of the paper's gain, and inside the dead zone if the gain is above 1.46 of the
+    paper's gain. Hence two series of runs are made: with a set point of 5 degC for all plants,
+    and with a set point of 5 degC times the gain factor of the plant.
     """
     fixed = plants_that_settle(batch, gains=(0.75, 1.0, 1.25, 1.4), is_scaled=False)
     scaled = plants_that_settle(batch, gains=(0.7, 1.0, 1.25, 1.5), is_scaled=True)

@@ -125,8 +125,7 @@ def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) 
     """Return the table of all findings, with the verdicts on the claims.
 
     The table has a row for each finding about a claim. A claim without findings has one row, in
-    which the number of runs is missing. Both `claims` and `findings`, the findings about each
-    claim, have the names of the claims as keys.
+    which the number of runs is missing.
     """
     rows: list[dict[str, Any]] = []
     for name, findings_of_claim in findings.items():

@@ -49,7 +49,7 @@ class Batch:
             or inputs of the paper's network. With equal learning rates, a larger network learns
             faster, as more terms of a sum change at the same time.
         direction
-            Sign of the plant's gain that each network assumes: -1, or 1 for the wrong sign.
+            Sign of the plant's gain that each network assumes: -1 (right) or 1 (wrong).
         """
         node_scale = 1.0
         input_scale = 1.0
@@ -103,7 +103,8 @@ class WeightLog:
     """A function that logs the weights of learning networks before each sample of a run."""
 
     networks: DirectNNController  # a batch of networks, one for each run
-    weights: list[Array] = field(default_factory=list)  # by sample, each (runs, weights)
+    # An array for each sample, shape (runs, weights).
+    weights: list[Array] = field(default_factory=list)
 
     def __call__(self, k: int) -> None:
         """Append the weights of all networks before they act at sample k."""
@@ -117,8 +118,9 @@ def converged_at(weights: Array) -> Array:
 
     The weights have converged at the first sample from which on their Euclidean distance from
     their final values is at most `CONVERGED_SHARE` times the distance at the start of the run.
-    If less than `CONVERGED_SAMPLES` samples of a run are left at this sample, the weights may
-    still be changing when the run ends, and the result is infinite.
+    The result is infinite for a run whose weights converge less than `CONVERGED_SAMPLES`
+    samples before the end of the run, since these weights may still be changing when the run
+    ends.
 
     `weights` has the weights of the networks before each sample, shape (samples, runs,
     weights).

@@ -1,4 +1,4 @@
-"""Find controllers that anticipate a square wave, and score them at random set points.
+"""Find controllers that anticipate a square wave, and score these at random set points.
 
 A controller anticipates if the controller acts before a change of the set point. Random set
 points are constant for at most half a period of the square wave, so that a policy that was
@@ -30,7 +30,7 @@ LEAST_MOVEMENT = 0.05
 # Number of different unforeseeable set points. As the least possible error for a set point
 # takes long to compute, a tenth of the runs has the same set point.
 TIMETABLES = 10
-TIMETABLE_SEED = 0  # of the times in the first unforeseeable set point, not of an episode
+TIMETABLE_SEED = 0  # seed of the first unforeseeable set point, not of an episode
 
 
 @dataclass(frozen=True)
@@ -86,17 +86,9 @@ def anticipation(
     can foresee. The result is None if the controller does not act before the changes, or the
     set point of the scenario is not a square wave.
 
-    Parameters
-    ----------
-    members
-        Records of the controller's members, one for each trained network.
-    trajectories
-        Signals of each member's runs in the scenario. If all runs of a member are equal, the
-        trajectory has a single run.
-    runs
-        Number of runs of each member.
-    seed
-        Seed of the first run; run i has the seed `seed + i`.
+    `members` has a record of the controller for each trained network, and `trajectories` has
+    the signals of each member in the scenario. Each member has `runs` runs, but the trajectory
+    has a single run if all runs are equal. Run i has the seed `seed + i`.
     """
     if scenario.parameters.setpoint != "square":
         return None
@@ -122,7 +114,7 @@ def follows_setpoint(trajectories: Sequence[Trajectory]) -> bool:
 def movement_before_changes(
     scenario: Scenario, trajectories: Sequence[Trajectory]
 ) -> Estimate | None:
-    """Return how far the output moves to a new set point before it can respond to the change.
+    """Return how far the output moves to a new set point before a response is possible.
 
     The movement is a share of the set-point change, as a mean over all changes. The result is
     None if the set point changes too often for measuring the movement.
@@ -132,10 +124,9 @@ def movement_before_changes(
     flows at or after the change. The movement is the mean output in the d + 1 samples after the
     change, minus the mean output in a window of d + 1 samples before the change. Of all windows
     between a quarter and three quarters of the time for which the old set point is constant,
-    the window is taken in which the mean output is nearest to the new set point. With this
-    window, a controller whose output oscillates around the old set point, or has not reached
-    the old set point, has little or no movement, and does not count as a controller that
-    anticipates.
+    the movement uses the window in which the mean output is nearest to the new set point. A
+    controller whose output oscillates around the old set point, or has not reached the old set
+    point, has little or no movement, and does not count as a controller that anticipates.
 
     `scenario` has a square wave, and `trajectories` has the signals of each member's runs.
     """
@@ -214,7 +205,7 @@ def surprising_setpoint(scenario: Scenario, seed: int) -> list[float]:
     value for half a period of the square wave on average. When a quarter of the period has
     passed after a change, the set point changes at each sample with the same probability, so
     that the time since the last change does not tell when the next change comes. `seed` is the
-    seed of the times of the changes.
+    seed of the random times of the changes.
     """
     generator = np.random.default_rng(seed)
     parameters = scenario.parameters

@@ -1,4 +1,4 @@
-"""Run controllers in scenarios, and compare their errors with the least possible errors.
+"""Run controllers in scenarios, and compare the errors with the least possible errors.
 
 A scenario is a plant, a set point and a length of the runs. The error of a run is the mean of
 |e|, the absolute error, over the samples of the run.
@@ -26,7 +26,7 @@ from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES
 
-BOOTSTRAP_SEED = 0  # of the resampling for confidence intervals, not of an episode
+BOOTSTRAP_SEED = 0  # seed of the resampling for confidence intervals, not of an episode
 
 # The anticipation of each controller that acts before a square wave changes, by the name of the
 # scenario and the name of the controller.
@@ -116,8 +116,6 @@ def responses_over_time(
     percentiles `output_median`, `output_p10`, `output_p90`, `applied_median`, `applied_p10` and
     `applied_p90` over all runs of all members. If the set points are random, the runs have
     different set points, and the percentiles are the values of the first run.
-
-    `trajectories` has the signals of a batch of runs for each member of the controller.
     """
     setpoint = trajectories[0].setpoint[:, 0]
     k = np.arange(len(setpoint))
@@ -162,7 +160,7 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     Raises
     ------
     ValueError
-        If no controller can have a smaller error than an idle valve.
+        If no controller can have a smaller error in `scenario` than an idle valve.
     """
     arguments = {
         "samples": scenario.samples,
@@ -212,7 +210,8 @@ def estimate(
         - `difference`: the mean over the runs of the controller's error minus the reference's
           error in the same run, degC, an `Estimate`;
         - `improvement`: the share of the runs in which the controller's error is smaller than
-          the reference's error, an `Estimate`. A run with equal errors counts as half a run.
+          the reference's error, an `Estimate`. A run in which both controllers have equal
+          errors counts as half a run.
     """
     reference = runs["agent"].iloc[0]
     rows = []
@@ -278,8 +277,8 @@ def ranked(estimates: pd.DataFrame, misfits: Collection[str]) -> dict[str, Estim
     """Return the overall score of each controller by name, the highest score first.
 
     The overall score is the mean score over all scenarios, members and runs, with the 95 %
-    confidence interval of `bootstrap`. `estimates` is the table that `estimate` returns. The
-    controllers in `misfits`, which do not fit all plants, come last in the result.
+    confidence interval of `bootstrap`. The controllers in `misfits`, which do not fit all
+    plants, come last in the result.
     """
     scores = {
         str(agent): bootstrap(*tables, seed=BOOTSTRAP_SEED)
@@ -308,8 +307,9 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
     """Write a table of numbers, texts and objects of class `Estimate` to the CSV file `path`.
 
     A column NAME of estimates becomes three columns: NAME has the values, and NAME_low and
-    NAME_high have the ends of the confidence intervals. An infinite end becomes an empty cell.
-    The infinite settling time of a run that does not settle becomes "not settled".
+    NAME_high have the ends of the confidence intervals. An infinite end of an interval becomes
+    an empty cell. The infinite settling time of a run that does not settle becomes "not
+    settled".
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():

@@ -98,8 +98,7 @@ class Comparison:
     results : sequence of Result
         Results of each controller in each scenario, from all tasks that have finished.
     scales : mapping
-        Least possible errors in each scenario, by the name of the scenario. Scenarios without
-        computed least possible errors are not part of the report.
+        Least possible errors by the name of the scenario, for all scenarios of the report.
     runs : pandas.DataFrame
         Table with a row for each run in each scenario, like `comparison.Result.runs`.
     estimates : pandas.DataFrame
@@ -109,8 +108,7 @@ class Comparison:
     misfits : mapping
         Sentences that say why a controller does not fit a plant, by the controller's name.
     scores : mapping
-        Overall score of each controller by name, the highest score first. The controllers in
-        `misfits` come last.
+        Overall score of each controller by name, in the order of the controllers in tables.
     """
 
     controllers: Mapping[str, ControllerSpec]
@@ -212,7 +210,7 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
 
 
 def sections(comparison: Comparison) -> list[Section]:
-    """Return the sections of the report. Sections with an empty table are left out."""
+    """Return the sections of the report. A section with an empty table is left out."""
     reference = label(str(comparison.runs["agent"].iloc[0]))
     scenarios = [scale.scenario for scale in comparison.scales.values()]
     candidates = [
@@ -324,7 +322,7 @@ def ratio_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts with least possible errors and error ratios in each scenario.
 
     The first two rows have the least possible errors without and with knowledge of future set
-    points, degC. Each further row has the error ratios of one controller.
+    points, degC. Each row below the first two rows has the error ratios of one controller.
     """
     bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
     for name, scale in comparison.scales.items():
@@ -380,8 +378,8 @@ def difference_table(comparison: Comparison) -> pd.DataFrame:
 def table_by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
     """Return a table of texts, with a row for each controller and a column for each scenario.
 
-    `cells` has the texts of the cells, and `rows` has the names `scenario` and `agent` (the
-    controller) for each text. The rows of the returned table have the order of `agents`.
+    `rows` has the columns `scenario` and `agent` (the controller), and `cells` has a text for
+    each row of `rows`. The rows of the returned table have the order of `agents`.
     """
     table = rows.assign(cell=cells).pivot(index="agent", columns="scenario", values="cell")
     table = table.loc[list(agents), rows["scenario"].unique()].fillna("").rename(index=label)
@@ -392,7 +390,7 @@ def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a table of texts with the parts of the mean error in the scenario `hard`, degC.
 
     The table has a column for each of `PARTS_OF_ERROR`, and a row for each controller, the
-    smallest mean error first. `runs` is a table like `comparison.Result.runs`.
+    smallest mean error first.
     """
     means = runs[runs["scenario"] == "hard"].groupby("agent")[list(PARTS_OF_ERROR)].mean()
     texts = means.sort_values("mae").map("{:.3f}".format)

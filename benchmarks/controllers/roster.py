@@ -53,8 +53,7 @@ def with_bank(
     """Return a self-tuning controller, which selects the best of a bank of plant models.
 
     The controller assumes the dead zone `widest_dead_zone`, the largest half width of the dead
-    zone that the plant can have, t/h. `kind` is the class of the controller, and the remaining
-    arguments are other arguments of the class.
+    zone that the plant can have, t/h.
     """
     return kind(dead_zone=widest_dead_zone, **prior_knowledge)
 
@@ -99,14 +98,14 @@ def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -
 def trained(kind: type[PolicyNetwork | RecurrentNetwork], files: str) -> Mapping[str, Any]:
     """Return trained networks of the class `kind`, by the name of the network's file.
 
-    The files are those in the folder `agents/pretrained` whose names match the pattern `files`,
-    such as "ppo-*.npz".
+    The files lie in the folder `agents/pretrained`, and have names that match the pattern
+    `files`, such as "ppo-*.npz".
     """
     return {file.name: kind.load(file) for file in PRETRAINED.glob(files)}
 
 
-# What a controller knows, and how it was searched or trained, in words for reports. In reports,
-# 1 M samples are a million samples.
+# Texts for reports: what a controller knows, and how the controller was searched or trained. In
+# reports, 1 M samples are a million samples.
 _KNOWS_STEP_TEST = "gain, time constant, delay"
 _KNOWS_DATA_SHEET = f"{_KNOWS_STEP_TEST}, dead zone, limits"
 _KNOWS_SIGN = "sign of the gain; settings searched on the paper's plant"
@@ -301,8 +300,8 @@ RENAMED = {
 def label(agent: str) -> str:
     """Return the name of a controller in tables and pictures, such as "MPC" for "mpc".
 
-    `agent` is the controller's name in options. A user's own controller has the name `agent` in
-    tables and pictures, too.
+    `agent` is the controller's name in options. In tables and pictures, a user's own controller
+    has the same name as in options.
     """
     return ROSTER[agent].label if agent in ROSTER else agent
 
@@ -310,9 +309,9 @@ def label(agent: str) -> str:
 def looks(agents: Sequence[str]) -> dict[str, tuple[str, str]]:
     """Return the colour and the marker, for matplotlib, of each controller by its name.
 
-    `agents` are the names of controllers in options. Users' own controllers, which are not in
-    `ROSTER`, get the colours and markers of `OWN_LOOKS` in alphabetical order of the names, so
-    that the order of `agents` does not matter.
+    Users' own controllers, which are not in `ROSTER`, get the colours and markers of
+    `OWN_LOOKS` in alphabetical order of the names, so that the order of `agents` does not
+    matter.
     """
     own_names = sorted(agent for agent in agents if agent not in ROSTER)
     own_looks = dict(zip(own_names, itertools.cycle(OWN_LOOKS), strict=False))

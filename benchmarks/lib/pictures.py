@@ -1,8 +1,9 @@
 """Make the pictures of reports in one style.
 
-A picture is 975 pixels wide, and its text is still readable when a page shows the picture 750
-pixels wide. A picture has a white background with a margin, so that it is also readable on a
-dark page. The title of a picture is a sentence that states the main result in the picture.
+A picture is 975 pixels wide, and has text that is still readable when a page shows the picture
+750 pixels wide. A picture has a white background with a margin, so that the picture is readable
+on a dark page, too. The title of a picture is a sentence that states the main result in the
+picture.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = "#0072B2", "#D55E00"  # colours of lines that do not belong to a controller
-WIDTH = 7.5  # of a picture, inches: 975 pixels at 130 dots per inch
-TITLE_CHARACTERS = 90  # per line of a title: as many as fit in the width of a picture
+WIDTH = 7.5  # width of a picture, inches: 975 pixels at 130 dots per inch
+TITLE_CHARACTERS = 90  # number of characters that fit in a line of a title
 PALETTE_SIZE = 128  # number of colours in a PNG file; fewer colours make the file smaller
 # matplotlib's `rcParams` for all pictures.
 STYLE: Any = {
@@ -83,7 +84,7 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         A sentence above the picture, broken into lines of at most `TITLE_CHARACTERS`
         characters.
     """
-    from matplotlib import rc_context  # imported here, as it is slow
+    from matplotlib import rc_context  # imported here, as the import is slow
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from PIL import Image

@@ -27,7 +27,7 @@ class Section:
     text : sequence of str
         Paragraphs of the section, above the table.
     table : pandas.DataFrame, optional
-        A table whose cells are texts.
+        Table whose cells are texts; None for a section without a table.
     bold : collection of str
         Texts that are shown in bold type in the cells of the table.
     pictures : mapping
@@ -118,10 +118,7 @@ def escape(text: object) -> str:
 
 
 def _source(origin: Mapping[str, Any]) -> str:
-    """Return the last line of a report: the start time, the version of the code, the command.
-
-    `origin` is the provenance of the results, as `provenance.origin` returns it.
-    """
+    """Return the last line of a report: start time, version of the code, and command."""
     version = f"code {origin['code'][:12]}"
     commit = origin["commit"]  # 40 digits, and "-dirty" if files have changed; "" without git
     if commit:
@@ -143,8 +140,8 @@ def _print(section: Section) -> None:
 def on_screen(table: pd.DataFrame) -> str:
     """Return a table as text whose lines are no wider than the terminal.
 
-    A table that is too wide for the terminal is split into several tables, one below the other.
-    Each of these tables has the first column and some of the remaining columns.
+    A table that is too wide for the terminal is split into several tables, one below the other,
+    each with the first column and some of the remaining columns.
     """
     width = shutil.get_terminal_size((150, 24)).columns
     first = table.columns[0]

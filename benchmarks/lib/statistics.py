@@ -9,7 +9,7 @@ import scipy  # SciPy loads its modules on first use.
 from numpy.typing import ArrayLike, NDArray
 
 INTERVAL_ENDS = 0.025, 0.975  # the quantiles that are the ends of a 95 % interval
-RESAMPLES = 2000  # of a bootstrap; so many resamples change the interval's ends only slightly
+RESAMPLES = 2000  # number of resamples of a bootstrap; with more, the interval hardly changes
 
 
 @dataclass(frozen=True)
@@ -112,25 +112,26 @@ def share(happened: NDArray[np.bool_]) -> Estimate:
 def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
     """Return the mean over tasks, members and runs, with an interval from a bootstrap.
 
-    Members are the networks of one controller that were trained with different seeds. All
-    members run with the same noise in run i, so members and runs are resampled independently,
-    and a resample consists of all pairs of a resampled member and a resampled run (A. B. Owen,
-    "The pigeonhole bootstrap", Annals of Applied Statistics 1, 2007, 386-411). Tasks are not
-    resampled. If the means of five members differ far more than the runs of a member, the 95 %
-    interval contains the true mean in only 82 % of the cases.
+    Members are the networks of one controller that were trained with different seeds. As all
+    members have the same noise in run i, members and runs are resampled independently: a
+    resample consists of all pairs of a resampled member and a resampled run (Owen 2007, "The
+    pigeonhole bootstrap", Annals of Applied Statistics 1, 386-411). Tasks are not resampled. If
+    the means of five members differ far more than the runs of a member, the 95 % interval
+    contains the true mean in only 82 % of the cases.
 
     Parameters
     ----------
     tasks
-        An array of values for each task, such as the errors in a scenario. All arrays have the
-        same shape: (members, runs), or (runs,) for a controller without members.
+        An array of values for each task, such as the errors in a scenario. All arrays of
+        `tasks` have the same shape: (members, runs), or (runs,) for a controller without
+        members.
     seed
         Seed of the resampling.
     """
     tables = [np.atleast_2d(np.asarray(task, dtype=np.float64)) for task in tasks]
     all_values = np.concatenate([table.ravel() for table in tables])
     mean = float(all_values.mean())
-    if all(np.ptp(table) == 0.0 for table in tables):  # Nothing was random.
+    if all(np.ptp(table) == 0.0 for table in tables):  # No value was random.
         return Estimate(mean, mean, mean, all_values.size)
     generator = np.random.default_rng(seed)
     members, runs = tables[0].shape

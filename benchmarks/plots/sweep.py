@@ -31,7 +31,7 @@ from benchmarks.lib.pictures import (
 from mptc_gym import Parameters
 
 NEAR_RATIO = 1.05  # largest error ratio that counts as near the least possible error
-MARKED_SHARE = 0.5  # smallest share of the runs on a plant that fail for a mark in the map
+MARKED_SHARE = 0.5  # A plant has a mark in the map if at least this share of its runs fail.
 MOST_COLUMNS = 3  # number of maps in a row
 RATIO_CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
 COLOUR_MAP = "viridis_r"  # light for small error ratios, dark for large ones
@@ -91,8 +91,8 @@ def plant_medians(runs: pd.DataFrame) -> pd.DataFrame:
 def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
     """Draw a curve of the sorted error ratios of the plants for each controller.
 
-    `plants` is the table that `plant_medians` returns. Plants whose least possible error is
-    unknown have no error ratio, and are left out of the curves.
+    Plants whose least possible error is unknown have no error ratio, and are left out of the
+    curves.
     """
     plants = plants.dropna(subset=["ratio"])
     styles = looks(list(plants["agent"].unique()))
@@ -116,8 +116,7 @@ def sorted_finding(plants: pd.DataFrame) -> str:
     """Return the title of the curves: a sentence on 90th percentiles of the error ratios.
 
     The sentence names the two controllers with the smallest 90th percentiles over the plants,
-    and the controller with the largest 90th percentile. `plants` is the table that
-    `plant_medians` returns.
+    and the controller with the largest 90th percentile.
     """
     ratios = plants.groupby("agent")["ratio"].quantile(0.9).sort_values()
     if ratios.empty:
@@ -176,7 +175,6 @@ def map_finding(plants: pd.DataFrame) -> str:
 
     The sentence compares the shares of the plants on which each controller has an error ratio
     of at most `NEAR_RATIO`: the two largest shares, and an upper limit of all smaller shares.
-    `plants` is the table that `plant_medians` returns.
     """
     bounded = plants.dropna(subset=["ratio"])  # plants with a least possible error
     is_near = bounded["ratio"] <= NEAR_RATIO
@@ -219,7 +217,7 @@ def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) ->
 def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
     """Return the legend of the maps: matplotlib's artists by text.
 
-    `plants` is the table that `plant_medians` returns. The legend has only marks that occur.
+    The legend has only marks that occur in the maps.
     """
     entries: dict[str, Artist] = {"the nominal plant": Line2D([], [], **NOMINAL_MARK)}
     if (plants["oscillates"] >= MARKED_SHARE).any():
