@@ -24,12 +24,12 @@ from mptc_gym import PRESETS, Parameters
 
 # Limits that give words of the claims, such as "notable", a meaning. The limits were chosen
 # before any run, and are the same for all claims.
-NOTABLE_CHANGE = 0.05  # a relative change of an error below this share is not "notable"
+NOTABLE_CHANGE = 0.05  # A relative change of an error is "notable" from this share on.
 LARGE_CHANGE = 0.2  # "much better", "seriously worse": the error differs by at least this share
-PAPER_CONVERGENCE = 150  # samples within which, according to the paper, the weights converge
+PAPER_CONVERGENCE = 150  # samples in which the weights converge, according to the paper
 
 SETPOINT_LEVEL = 5.0  # degC, the constant set point, and the amplitude of the square wave
-RUN_LENGTH = 1200  # samples, unless the case has another length
+RUN_LENGTH = 1200  # length of a run, samples, unless the case has another length
 LEARNING_LENGTH = 600  # samples after which a network counts as trained
 WITH_NOISE = PRESETS["noisy"]
 NOISY_SQUARE_TITLE = "square wave, R = 0.5 °C²"
@@ -263,7 +263,7 @@ def reliability(batch: Batch) -> Findings:
     output of this node is always 0, or always 1.
     """
     for in_proportion, stuck_at in itertools.product((False, True), (0, 1)):
-        errors = {}  # after the failure, by the number of nodes
+        errors = {}  # mean errors after the failure, by the number of nodes
         for nodes in (3, 6, 12):
             networks = batch.networks(nodes=nodes, in_proportion=in_proportion)
             damage = partial(damage_networks, networks, stuck_at)

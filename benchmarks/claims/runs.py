@@ -14,8 +14,9 @@ Array = NDArray[np.floating]
 
 PAPER_NODES = 3  # number of hidden nodes of the paper's network
 PAPER_LENGTH = 3  # number of latest set points, and of latest errors, as the network's inputs
-# Weights have converged if their distance from their final values is at most this share of the
-# distance at the start of the run, for at least this many samples at the end of the run.
+# The weights of a network have converged if, for at least `CONVERGED_SAMPLES` samples at the
+# end of a run, their distance from their final values is at most `CONVERGED_SHARE` times the
+# distance at the start of the run.
 CONVERGED_SHARE = 0.05
 CONVERGED_SAMPLES = 100
 
@@ -25,7 +26,7 @@ class Batch:
     """A batch of independent runs of controllers on plants."""
 
     runs: int  # number of runs
-    seed: int = 0  # run i has the initial weights and the noise of the seed `seed + i`
+    seed: int = 0  # seed of the first run; run i has the seed `seed + i`
 
     def networks(
         self,

@@ -79,7 +79,7 @@ CASES_TEXT = (
 )
 MOST_PICTURED = 8  # largest number of controllers in a picture of responses over time
 MISFIT_MARK = "†"  # marks controllers that were made for another plant
-PARTS_OF_ERROR = {  # the columns of a part of the mean error, and of the mean error
+PARTS_OF_ERROR = {  # names of the parts of the mean error in CSV files and in the report
     "mae_start": f"first {START_SAMPLES} samples",
     "mae_changes": f"{RESPONSE_SAMPLES} samples after later changes",
     "mae_steady": "remaining samples",

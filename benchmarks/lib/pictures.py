@@ -55,8 +55,8 @@ RATIO_LABEL = (
     "error ratio: mean error / least possible error\n(axis logarithmic in the ratio minus 1)"
 )
 # The smallest error ratio on the axis; smaller error ratios are drawn at `RATIO_FLOOR`. An
-# error ratio of 1 would lie at minus infinity on an axis that is logarithmic in the ratio minus
-# 1.
+# error ratio of 1 would lie at minus infinity on an axis that is logarithmic in the error ratio
+# minus 1.
 RATIO_FLOOR = 1.001
 # Error ratios with a label on the axis of error ratios, about equally far apart.
 RATIO_TICKS = 1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0, 4.0, 11.0, 31.0
