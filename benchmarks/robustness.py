@@ -29,8 +29,8 @@ PANELS = {
     "square-noise": "square wave with noise, R = 0.5 °C²",
     "load": "load steps at a held set point",
 }
-# Values of Ms, the largest magnitude of the loop's sensitivity function: the lower, the more
-# robust is the loop. `ROBUSTNESS` is the Ms at which controllers are compared.
+# Values of Ms, the largest magnitude of the loop's sensitivity function: the lower Ms is, the
+# more robust is the loop. `ROBUSTNESS` is the Ms at which controllers are compared.
 SENSITIVITIES = 1.2, 1.3, 1.4, 1.5, ROBUSTNESS, 1.7, 1.8, 2.0, 2.3
 TRAVEL_TICKS = 200, 500, 1000, 2000, 5000  # ticks of the axis of valve travel in noise, t/h
 TEXT = (
@@ -54,16 +54,16 @@ CAPTION = "Error ratio over valve travel of three linear controllers at several 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Run PI (SIMC), Smith and Dahlin on the paper's plant, each at several robustnesses."""
+    """Run PI (SIMC), Smith and Dahlin, each tuned to several values of the robustness Ms."""
 
     runs: Runs = 100
-    """Runs of each rule in each case with noise or load."""
+    """The number of runs of each controller in each case with noise or load."""
     fan_out: FanOut = field(default_factory=FanOut)
     out: Folder = Path("results/robustness")
 
 
 def work(options: Options) -> str:
-    """Run all controllers, write the results, and return a sentence on where they are."""
+    """Run all controllers, write the results, and return a sentence that names their folder."""
     import pandas as pd
 
     from benchmarks.lib.report import Section, write_report
@@ -97,25 +97,26 @@ def lowest(scenario: Scenario) -> float:
 
 
 def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
-    """Run a controller that is tuned to a robustness, and return a row for each case.
+    """Run a controller that is tuned to a maximum sensitivity, and return a row for each case.
 
-    Parameters
-    ----------
-    name
-        Name of the controller, one of `TUNED_BY_RULE`.
-    sensitivity
-        The robustness to which the controller is tuned on the paper's plant: the maximum
-        sensitivity Ms, which is the largest magnitude of the loop's sensitivity function.
-    runs
-        Number of runs in each case with noise or load. In any other case, one run is enough.
+    The control loop with the paper's plant has the maximum sensitivity `sensitivity`, which is
+    the largest magnitude of the loop's sensitivity function. `name` is one of `TUNED_BY_RULE`.
+    Cases with noise or load have `runs` runs, and all other cases have one run.
 
     Returns
     -------
     list of dict
-        Each row has the keys `agent` (the name of the controller); `Ms`; the name of the tuning
-        rule's time constant, s; `shortest_delay` and `longest_delay` (samples), between which
-        the loop is stable; `case`; `mean_error` (degC) and `travel` (the valve travel, t/h).
-        The mean error and the valve travel are means over the runs.
+        A dict for each case, with these keys:
+
+        - `agent`: the name of the controller;
+        - `Ms`: the maximum sensitivity;
+        - `closed_loop_time_constant` or `filter_time_constant`: the time constant of the
+          controller that the tuning rule chooses, s;
+        - `shortest_delay` and `longest_delay`: the shortest and the longest delay with which
+          the loop is stable, samples;
+        - `case`: the name of the case;
+        - `mean_error`: the mean absolute error over the runs, degC;
+        - `travel`: the mean valve travel over the runs, t/h.
     """
     spec = replace(ROSTER[name], sensitivity=sensitivity)
     shortest, longest = spec.loop({}).stable_delays() or (None, None)
@@ -143,9 +144,9 @@ def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
 def overview(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the table of the report, a table of texts with a row for each controller.
 
-    `rows` are the rows of `run_rule` for all controllers at a single Ms, with an additional
-    column `ratio`, the mean error divided by the least possible error. The table of the report
-    has a column of error ratios for each case.
+    The table of the report has a column of error ratios for each case. `rows` has the rows that
+    `run_rule` returns for all controllers at a single Ms, and an additional column `ratio`: the
+    mean error divided by the least possible error.
     """
     import pandas as pd
 
@@ -170,9 +171,8 @@ def overview(rows: pd.DataFrame) -> pd.DataFrame:
 def finding(rows: pd.DataFrame) -> str:
     """Return the picture's title, which compares errors and valve travels in noise.
 
-    `rows` are the rows of `run_rule` for all controllers and Ms, with the column `ratio`, the
-    mean error divided by the least possible error. The title compares, at an Ms of
-    `ROBUSTNESS`, the controllers with the least and with the most valve travel.
+    The title compares the controllers with the least and the most valve travel at an Ms of
+    `ROBUSTNESS`. `rows` is a table like the argument `rows` of `draw`.
     """
     noisy = rows[(rows["Ms"] == ROBUSTNESS) & (rows["case"] == "square-noise")]
     ordered = noisy.sort_values("travel")
@@ -188,8 +188,9 @@ def finding(rows: pd.DataFrame) -> str:
 def draw(rows: pd.DataFrame, path: Path) -> None:
     """Draw error ratios over valve travel, and write the picture to the file `path`.
 
-    `rows` are the rows of `run_rule` for all controllers and Ms, with the column `ratio`, the
-    mean error divided by the least possible error. Each case of `PANELS` has a panel.
+    The picture has a panel for each case of `PANELS`. `rows` has the rows that `run_rule`
+    returns for all controllers and values of Ms, and an additional column `ratio`: the mean
+    error divided by the least possible error.
     """
     from matplotlib.lines import Line2D
     from matplotlib.ticker import MaxNLocator, NullLocator
@@ -222,8 +223,8 @@ def draw(rows: pd.DataFrame, path: Path) -> None:
 def _draw_rule(panel: Any, rows: pd.DataFrame, name: str) -> None:
     """Draw a controller's line of error ratio over valve travel in a panel.
 
-    The line has a mark for each Ms, and a large mark at the Ms `ROBUSTNESS`. `panel` are axes
-    of Matplotlib, and `rows` are the rows of `run_rule` of one case, in the order of Ms.
+    The line has a mark for each value of Ms, and a large mark at an Ms of `ROBUSTNESS`. `rows`
+    has the rows of one controller and one case, in the order of Ms.
     """
     colour, marker = ROSTER[name].look
     style: Any = {"color": colour, "marker": marker}

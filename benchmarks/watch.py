@@ -32,20 +32,20 @@ class Options:
     agent: str = "nn"
     """The controller: a name as in `compare`, or your own controller, NAME=MODULE:FACTORY."""
     scenario: str | None = None
-    """The case to run, as in `compare`. On a plant of your own, the cases are square and
-    constant, or run if the plant has a set point (default: the first case)."""
+    """The case to run, as in `compare`. The cases on a plant of your own are square and
+    constant, or the single case run if the plant has a set point (default: the first case)."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     seed: Seed = 0
-    """The seed of noise and initial weights."""
+    """The seed of the noise and of the controller's initial weights."""
     video: Path | None = None
     """The file of the film, which ends in .gif (default: a file in results/watch)."""
 
 
 def work(options: Options) -> str:
-    """Run a controller on a case, write a film of the run, and return two lines of text.
+    """Run a controller in a case, write a film of the run, and return two lines of text.
 
-    The first line has the mean error of the run, and the second line names the file. A
-    `UsageError` is raised if an option is invalid.
+    The first line of the text has the mean error of the run, and the second line names the
+    film's file. A `UsageError` is raised if `options` has an invalid value.
     """
     cases = options.plant.cases(SCENARIOS)
     case_name = options.scenario or next(iter(cases))
@@ -71,9 +71,9 @@ def work(options: Options) -> str:
 
 
 def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed: int) -> None:
-    """Write a film of a run to the GIF file `path`; the other arguments are those of `frames`.
+    """Write a film of the first run in `trajectory` to the GIF file `path`.
 
-    The film replaces an older film only when it is complete.
+    An existing file `path` is replaced only when the new film is complete.
     """
     from PIL.Image import Dither, Quantize
 
@@ -92,21 +92,22 @@ def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed:
 def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterator[Image]":
     """Yield the frames of a film: pictures in the style of the environment's `render`.
 
-    There is a picture for every `SAMPLES_PER_FRAME` samples. While the environment draws the
-    latest samples only, each frame spans the whole run, so that its start stays visible.
+    The film has a frame for every `SAMPLES_PER_FRAME` samples of the run. The time axis of each
+    frame spans the whole run, while the environment draws only the latest samples.
 
     Parameters
     ----------
     trajectory
-        The signals of a batch of runs; the film shows the first run.
+        Signals of a batch of runs; the film shows the first run.
     parameters
-        The arguments of the environment.
+        Arguments of the environment.
     seed
-        The seed of the first run, with which the environment drew the numbers of the plant.
+        Seed of the first run, with which the environment drew the parameter values of the
+        plant.
     """
     from PIL import Image
 
-    from mptc_gym.environments.drawing import frame  # imported here, as it needs pygame
+    from mptc_gym.environments.drawing import frame  # imported here, as the module needs pygame
     from mptc_gym.environments.record import Record
 
     drawn = drawn_numbers(parameters, 1, seed)
@@ -115,7 +116,7 @@ def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterat
     record = Record(PlantNumbers(**numbers), parameters.sampling_interval, initial_setpoint)
     samples = len(trajectory.setpoint)
     record.span = samples
-    record.samples = deque(record.samples)  # without a limit of the length
+    record.samples = deque(record.samples)  # a deque without a maximum length
     next_outputs = trajectory.next_setpoint - trajectory.next_error
     for k in range(samples):
         record.add(
@@ -124,8 +125,8 @@ def frames(trajectory: Trajectory, parameters: Parameters, seed: int) -> "Iterat
             command=float(trajectory.command[k, 0]),
             applied=float(trajectory.applied[k, 0]),
         )
-        # The set point often changes at the last sample of a run, where a picture would show a
-        # large error. So each picture is one sample earlier.
+        # The set point often changes at the last sample of a run, where a frame would show a
+        # large error. Hence each frame ends one sample earlier.
         if (record.k + 1) % SAMPLES_PER_FRAME == 0:
             yield Image.fromarray(frame(record))
 

@@ -87,6 +87,18 @@ def test_settled_are_the_last_50_samples():
             assert settled(trajectory([sign * 5.0] * 100, sign * outputs)) == [has]
 
 
+def test_learning_is_asked_for_only_on_plants_that_change():
+    class Short(Batch):
+        def run(self, agent, samples, before=None, **arguments):
+            return super().run(agent, min(samples, 20), before, **arguments)
+
+    findings = list(examinations.keep_learning(Short(2)))
+    for finding in findings:
+        compares = finding["quantity"].startswith("mean error of learning weights")
+        changes = not finding["quantity"].endswith("no change")
+        assert finding["criterion"] == ("at most 0.95" if compares and changes else "")
+
+
 class TestCommand:
     def test_what_has_finished_is_written(self, tmp_path, monkeypatch, capsys):
         fails = Claim("", "", "", Mock(side_effect=ArithmeticError("no weights")))

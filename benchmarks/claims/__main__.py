@@ -17,22 +17,22 @@ from benchmarks.lib.storage import write_csv
 class Options:
     """Test the paper's claims, each on a thousand runs.
 
-    The verdicts go to report.md, all numbers to claims.csv.
+    The verdicts on the claims are written to report.md, and all numbers to claims.csv.
     """
 
     claims: Names = field(default=(), kw_only=False)
     """Claims to test (default: all)."""
     runs: Runs = 1000
-    """Runs of each case."""
+    """The number of runs of each case."""
     fan_out: FanOut = field(default_factory=FanOut)
     out: Folder = Path("results/claims")
 
 
 def work(options: Options) -> str:
-    """Examine the claims, write the report, and return a sentence that says where it is.
+    """Test claims of the paper, write a report, and return a sentence that names its file.
 
-    If the examination of a claim fails, the report on all other claims is written before the
-    error is raised.
+    If the test of a claim raises an error, the report on the finished tests is written before
+    the error is raised again.
     """
     from benchmarks.claims.claims import CLAIMS, examined
     from benchmarks.claims.findings import sections, table
@@ -41,7 +41,7 @@ def work(options: Options) -> str:
 
     names = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
     provenance = origin()
-    # The last claims take longest, and start first.
+    # The tests of the last claims take longest, so these tests start first.
     tasks = {name: partial(examined, name, Batch(options.runs)) for name in reversed(names)}
     findings: dict[str, Any] = {}
     with results_folder(options.out) as folder:

@@ -16,12 +16,13 @@ from benchmarks.claims.runs import Batch
 
 
 class Claim(NamedTuple):
-    """A claim of the paper, and how the claim is examined."""
+    """A claim of the paper, with the function that examines the claim."""
 
     section: str  # where the claim is in the paper
     statement: str  # the claim in one sentence
     method: str  # how the claim is examined, and what its words mean, for the report
-    # Takes a `Batch`, and returns the findings; None if the claim cannot be examined.
+    # Function that takes a `Batch` and returns the findings; None if the claim cannot be
+    # examined.
     examine: Callable[[Batch], Findings] | None
 
 
@@ -157,10 +158,7 @@ CLAIMS = {
 
 
 def examined(name: str, batch: Batch) -> list[Finding]:
-    """Run the examination of a claim, and return all findings about the claim.
-
-    `name` is a key of `CLAIMS`, and `batch` gives the number of runs and their seeds.
-    """
+    """Run the examination of a claim, and return all findings about the claim."""
     examine = CLAIMS[name].examine
     if examine is None:
         return []

@@ -1,8 +1,8 @@
-"""Make the runs that examine the paper's claims, and judge their results by criteria.
+"""Run controllers to examine the paper's claims, and judge the results by criteria.
 
 The paper is that of Cui and Shin (1992), whose controller is a neural network (NN) that learns
-online. Each function that takes a `Batch` and yields `Findings` examines a claim, or two claims
-that differ in an argument. `benchmarks.claims.claims` has the words of the claims.
+online. Each function that takes a `Batch` and returns `Findings` examines one claim, or two
+similar claims.
 """
 
 import itertools
@@ -22,19 +22,19 @@ from benchmarks.loop.scenarios import SETPOINTS as PAPER_SETPOINTS
 from benchmarks.loop.scenarios import Arguments, Scenario
 from mptc_gym import PRESETS, Parameters
 
-# Numbers that give words of the claims a meaning. They were chosen before any run, and are the
-# same for all claims.
-NOTABLE_CHANGE = 0.05  # a relative change of an error below this share is not "notable"
+# Limits that give words of the claims, such as "notable", a meaning. The limits were chosen
+# before any run, and are the same for all claims.
+NOTABLE_CHANGE = 0.05  # A relative change of an error is "notable" from this share on.
 LARGE_CHANGE = 0.2  # "much better", "seriously worse": the error differs by at least this share
-PAPER_CONVERGENCE = 150  # samples within which, according to the paper, the weights converge
+PAPER_CONVERGENCE = 150  # samples in which the weights converge, according to the paper
 
 SETPOINT_LEVEL = 5.0  # degC, the constant set point, and the amplitude of the square wave
-RUN_LENGTH = 1200  # samples, unless the case has another length
+RUN_LENGTH = 1200  # length of a run, samples, unless the case has another length
 LEARNING_LENGTH = 600  # samples after which a network counts as trained
 WITH_NOISE = PRESETS["noisy"]
 NOISY_SQUARE_TITLE = "square wave, R = 0.5 °C²"
-# The cases of the set point. The constant set point comes first: without later changes, its
-# error comes from initial learning alone.
+# Cases with different set points. The case with a constant set point comes first, as the error
+# in this case comes from initial learning alone.
 SETPOINTS = PAPER_SETPOINTS[::-1]
 CONSTANT_SETPOINT, SQUARE_WAVE = (setpoint.arguments for setpoint in SETPOINTS)
 # Words for the learning rates ("gains") of a network with more nodes or inputs than the paper's
@@ -88,9 +88,10 @@ def dead_zone(batch: Batch) -> Findings:
 
 
 def noise(batch: Batch) -> Findings:
-    """Compare the paper's network with an idle valve, on plants with noise.
+    """Compare the paper's network with an idle valve (a flow of 0 t/h) on plants with noise.
 
-    At a constant set point, only the last 600 of 1,200 samples count, when learning is over.
+    At a constant set point, only the last 600 of 1,200 samples are evaluated, since the network
+    has learnt by then.
     """
     idle_runs = batch.run_pi({"kp": 0.0, "ki": 0.0}, RUN_LENGTH, setpoint=0.0, **WITH_NOISE)
     idle_deviation = idle_runs[-600:].output.std(axis=0)
@@ -119,9 +120,9 @@ def noise(batch: Batch) -> Findings:
 
 
 def pi_gains(batch: Batch) -> Findings:
-    """Examine the paper's PI controller, and PI controllers with another gain Kp.
+    """Examine the paper's PI controller, and PI controllers with a lower or higher gain Kp.
 
-    The claim is that the paper's controller oscillates, that a lower Kp is not notably better,
+    The paper claims that its PI controller oscillates, that a lower Kp is not notably better,
     and that a higher Kp makes the loop unstable.
     """
     kp = PAPER_PI["kp"]
@@ -160,11 +161,7 @@ def pi_gains(batch: Batch) -> Findings:
 
 
 def best_lower_gain(batch: Batch, title: str, arguments: Arguments) -> Finding:
-    """Compare the paper's PI controller with the best of those with a lower gain Kp.
-
-    `title` is the name of a case, and `arguments` are the arguments of the environment in this
-    case.
-    """
+    """Compare the paper's PI controller with the best PI controller with a lower gain Kp."""
     errors = [mean_error(batch.run_pi(gains, RUN_LENGTH, **arguments)) for gains in LOWER_PI]
     paper_errors = errors[-1]  # LOWER_PI ends with the paper's gains.
     medians = [float(np.median(error)) for error in errors[:-1]]
@@ -172,15 +169,15 @@ def best_lower_gain(batch: Batch, title: str, arguments: Arguments) -> Finding:
     return judge(
         f"mean error with the best lower Kp ({LOWER_PI[best]['kp']:.1f}) as a multiple of "
         f"the error with {PAPER_PI['kp']:g}, {title}",
-        (errors[best] / paper_errors).squeeze(),  # one exact number without noise
+        (errors[best] / paper_errors).squeeze(),  # Without noise, each array has one number.
         at_least=1 - NOTABLE_CHANGE,
     )
 
 
 def largest_pole(gains: PIGains) -> float:
-    """Return the largest magnitude of a pole of the paper's plant with a PI controller.
+    """Return the largest magnitude of the poles of a PI controller's loop on the paper's plant.
 
-    The control loop is taken without the actuator's dead zone and limits. It is stable if the
+    The loop, in which dead zone and limits of the actuator are left out, is stable if the
     largest magnitude is below 1.
     """
     plant = linear.nominal(Parameters())
@@ -188,7 +185,7 @@ def largest_pole(gains: PIGains) -> float:
 
 
 def against_pi(batch: Batch, gains: PIGains) -> Findings:
-    """Compare the paper's network with a PI controller of these gains, in the same noise."""
+    """Compare the errors of the paper's network and of a PI controller in the same noise."""
     for noise_title, noise_arguments in (("", {}), (", R = 0.5 °C²", WITH_NOISE)):
         for setpoint in SETPOINTS:
             arguments = {**setpoint.arguments, **noise_arguments}
@@ -212,8 +209,8 @@ def against_pi(batch: Batch, gains: PIGains) -> Findings:
 def wrong_direction(batch: Batch) -> Findings:
     """Measure when runs diverge if the networks assume the wrong sign of the plant's gain.
 
-    A run has diverged when the temperature exceeds 90 % of the largest deviation that the flow,
-    which is limited, can cause.
+    A run has diverged when the temperature exceeds 90 % of the largest steady temperature
+    change that the flow can cause within its limits.
     """
     runs = batch.run(batch.networks(direction=1), 600, **CONSTANT_SETPOINT)
     plant = Parameters()
@@ -238,9 +235,9 @@ def wrong_direction(batch: Batch) -> Findings:
 def other_shapes(batch: Batch, shapes: Mapping[str, dict[str, int]]) -> Findings:
     """Compare networks with more nodes or inputs with the paper's network.
 
-    `shapes` has the arguments `nodes` or `length` of `Batch.networks` for each kind of network,
-    by its title in the report. Each kind of network runs with the paper's learning rates, and
-    with learning rates that are scaled in proportion.
+    `shapes` gives, for the title of each kind of network in the report, the argument `nodes` or
+    `length` of `Batch.networks`. Each kind of network runs with the paper's learning rates, and
+    with smaller learning rates (the argument `in_proportion` of `Batch.networks`).
     """
     noisy_square = Scenario("noisy-square", NOISY_SQUARE_TITLE, RUN_LENGTH, WITH_NOISE)
     for case in (*SETPOINTS, noisy_square):
@@ -262,10 +259,11 @@ def other_shapes(batch: Batch, shapes: Mapping[str, dict[str, int]]) -> Findings
 def reliability(batch: Batch) -> Findings:
     """Compare networks of 3, 6 and 12 hidden nodes, before and after the failure of a node.
 
-    After `LEARNING_LENGTH` samples, the output of one hidden node stays at 0 or at 1 for ever.
+    In each network, one hidden node fails after `LEARNING_LENGTH` samples: from then on, the
+    output of this node is always 0, or always 1.
     """
     for in_proportion, stuck_at in itertools.product((False, True), (0, 1)):
-        errors = {}  # after the failure, by the number of nodes
+        errors = {}  # mean errors after the failure, by the number of nodes
         for nodes in (3, 6, 12):
             networks = batch.networks(nodes=nodes, in_proportion=in_proportion)
             damage = partial(damage_networks, networks, stuck_at)
@@ -292,14 +290,15 @@ def reliability(batch: Batch) -> Findings:
 def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None:
     """Damage the first hidden node of each network at the sample k = `LEARNING_LENGTH`.
 
-    A rollout calls this function before each sample. The output of the damaged node stays at
-    `stuck_at`, 0 or 1, and the other nodes go on learning.
+    At any other sample, nothing happens. After the damage, the output of the damaged node is
+    always `stuck_at`, which is 0 or 1. All undamaged nodes continue to learn.
     """
     if k != LEARNING_LENGTH:
         return
     weights = networks.weights
     weights.W[..., 0, :] = 0.0
-    # So far out on the sigmoid the slope vanishes: the node cannot learn.
+    # With a threshold of this size, the slope of the node's sigmoid function is 0, so that the
+    # node cannot learn.
     weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
     networks.weights = weights
 
@@ -307,8 +306,8 @@ def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None
 def keep_learning(batch: Batch) -> Findings:
     """Compare learning and frozen networks on plants that differ from the training plant.
 
-    The networks learn on the paper's plant. Then the gain or the delay of the plant changes,
-    and the weights either continue to learn or stay as they are.
+    The networks first learn on the paper's plant. After this training, the gain or the delay of
+    the plant changes, and the weights of the networks either continue to learn or are frozen.
     """
     networks = batch.networks()
     batch.run(networks, RUN_LENGTH, **SQUARE_WAVE)
@@ -328,12 +327,13 @@ def keep_learning(batch: Batch) -> Findings:
         networks.weights = learnt_weights
         networks.learning = False
         frozen_errors = mean_error(batch.run(networks, RUN_LENGTH, **SQUARE_WAVE, **plant))
+        at_most = math.inf  # Without a change, the number is for information only.
+        if plant:
+            at_most = 1 - NOTABLE_CHANGE
         yield judge(
             f"mean error of learning weights divided by that of frozen weights, {title}",
             learning_errors / frozen_errors,
-            at_most=1 - NOTABLE_CHANGE
-            if plant
-            else math.inf,  # "no change" is information only
+            at_most=at_most,
         )
         yield judge(f"mean error of frozen weights, {title}", frozen_errors, "°C")
         is_useless = frozen_errors >= SETPOINT_LEVEL  # the mean error without control
@@ -341,13 +341,12 @@ def keep_learning(batch: Batch) -> Findings:
 
 
 def direction_only(batch: Batch) -> Findings:
-    """Measure how often the paper's network settles on plants with other dynamics.
+    """Measure how often the paper's network settles on plants with other parameter values.
 
-    The plants differ from the paper's plant in delay, gain and time constant. The steady flow
-    for a set point of 5 degC lies beyond the actuator's limits if the gain is below 0.74 of the
-    paper's gain, and inside the dead zone if the gain is above 1.46 of the paper's gain. So
-    there are two series of runs: with a set point of 5 degC, and with a set point of 5 degC
-    times the gain factor.
+    The steady flow for a set point of 5 degC lies beyond the actuator's limits if the gain is
+    below 0.74 of the paper's gain, and inside the dead zone if the gain is above 1.46 of the
+    paper's gain. Hence two series of runs are made: with a set point of 5 degC for all plants,
+    and with a set point of 5 degC times the gain factor of the plant.
     """
     fixed = plants_that_settle(batch, gains=(0.75, 1.0, 1.25, 1.4), is_scaled=False)
     scaled = plants_that_settle(batch, gains=(0.7, 1.0, 1.25, 1.5), is_scaled=True)
@@ -374,25 +373,19 @@ def direction_only(batch: Batch) -> Findings:
 def plants_that_settle(
     batch: Batch, gains: Iterable[float], *, is_scaled: bool
 ) -> pd.DataFrame:
-    """Run the paper's network on plants with other dynamics, and return a row for each plant.
+    """Run the paper's network on several plants, and return a table with a row for each plant.
 
-    The plants are all combinations of three time constants, four delays and these gains.
-
-    Parameters
-    ----------
-    batch
-        Number and seeds of the runs on each plant.
-    gains
-        Gains of the plants, as multiples of the paper's gain.
-    is_scaled
-        Whether the set point is 5 degC times the gain factor, in place of 5 degC.
+    The plants are all combinations of three time constants, four delays, and the gain factors
+    `gains`, which are multiples of the paper's gain. If `is_scaled` is true, the set point is
+    5 degC times the gain factor of the plant; otherwise, the set point is 5 degC.
 
     Returns
     -------
     DataFrame
-        The columns are `constant` and `gain`, factors of the paper's time constant and gain;
-        `delay`, samples; `runs`, an array of shape (runs,) that says whether each run settles;
-        and `share`, the share of runs that settle.
+        The table has the columns `constant` and `gain` (time constant and gain of the plant, as
+        multiples of the paper's values), `delay` (samples), `runs` (an array of shape (runs,)
+        that says whether each run settles) and `share` (the share of runs that settle, from 0
+        to 1).
     """
     rows = []
     for constant, gain, delay in itertools.product((0.5, 1.0, 2.0), gains, (9, 18, 27, 36)):
@@ -407,8 +400,8 @@ def plants_that_settle(
 def judge_worst(plants: pd.DataFrame, text: str) -> Finding:
     """Return a finding about the plant on which the smallest share of runs settles.
 
-    `plants` are rows of the table of `plants_that_settle`, and `text` describes these plants in
-    the report.
+    `plants` are rows of the table that `plants_that_settle` returns, and `text` describes these
+    plants in the report.
     """
     worst = plants.iloc[plants["share"].argmin()]
     quantity = (

@@ -38,21 +38,23 @@ def judge(
     quantity
         What was measured, in words.
     value
-        The number: an `Estimate`; or an array with a value for each run, shape (runs,), of
-        which the median is estimated; or an exact number.
+        The measured number: an `Estimate`; or an exact number; or an array with a value for
+        each run, shape (runs,), in place of which the finding has the median over the runs.
     unit
         Unit of the number in the report; "" if the number has no unit.
     at_least, at_most
-        Lower and upper bound of the number that a claim of the paper asks for. Without any
-        bound, the number is for information only, and does not count in the verdict.
+        Lower and upper bound of the measured number that a claim of the paper asks for. If both
+        bounds are infinite, the number is for information only, and does not count in the
+        verdict.
 
     Returns
     -------
     dict
-        `quantity`; `unit`; `value`, `low`, `high` and `runs` of the `Estimate`; `criterion`,
-        the bounds in words; and `shown`: "yes" if the entire 95 % interval satisfies the
-        bounds, "no" if the entire interval violates a bound, and otherwise "undecided". Without
-        a bound, `criterion` and `shown` are "".
+        The finding has the keys `quantity`, `unit`, `value`, `low`, `high` and `runs` (the
+        attributes of an `Estimate`), `criterion` (the bounds in words) and `shown`. The value
+        of `shown` is "yes" if the entire 95 % interval satisfies the bounds, "no" if the entire
+        interval violates a bound, and otherwise "undecided". If both bounds are infinite,
+        `criterion` and `shown` are "".
     """
     if isinstance(value, Estimate):
         estimate = value
@@ -82,27 +84,21 @@ def judge(
 def judge_share(
     quantity: str, happened: NDArray[np.bool_], *, is_criterion: bool = False
 ) -> Finding:
-    """Return a finding about the share of runs in which something happened, in percent.
+    """Return a finding about the share of runs in which an event happened, in percent.
 
-    Parameters
-    ----------
-    quantity
-        What happened, in words.
-    happened
-        Whether it happened in each run, shape (runs,).
-    is_criterion
-        Whether the claim asks for a share of at least `MOST_RUNS`. If not, the share is for
-        information only.
+    `quantity` names the event in words, and `happened` says for each run whether the event
+    happened, shape (runs,). If `is_criterion` is true, the claim asks for a share of at least
+    `MOST_RUNS`; otherwise, the share is for information only.
     """
     at_least = 100 * MOST_RUNS if is_criterion else -inf
     return judge(quantity, share(happened).scaled(100), "% of runs", at_least=at_least)
 
 
 def judge_times(quantity: str, samples: ArrayLike) -> Iterator[Finding]:
-    """Yield findings without a criterion: the 10th, 50th and 90th percentile of a time.
+    """Yield the 10th, 50th and 90th percentile of a time as findings without a criterion.
 
-    `quantity` says in words which time was measured. `samples` holds the time in each run,
-    samples, shape (runs,); infinity means that the event never happened in the run.
+    `quantity` says in words which time was measured. `samples` has the time of an event in each
+    run, in samples, shape (runs,); the time is infinite in a run without the event.
     """
     for probability in (0.1, 0.5, 0.9):
         estimate = quantile(samples, probability)
@@ -129,8 +125,7 @@ def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) 
     """Return the table of all findings, with the verdicts on the claims.
 
     The table has a row for each finding about a claim. A claim without findings has one row, in
-    which `runs` is missing. `claims` has the claims by name, and `findings` has the findings
-    about each claim by the name of the claim.
+    which the number of runs is missing.
     """
     rows: list[dict[str, Any]] = []
     for name, findings_of_claim in findings.items():
@@ -142,16 +137,13 @@ def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) 
         }
         numbers = findings_of_claim or [{"runs": None}]
         rows.extend({**claim_columns, **finding} for finding in numbers)
-    # Nullable integers, as a claim without findings has no runs.
+    # The type `Int64` allows missing numbers, and a claim without findings has no number of
+    # runs.
     return pd.DataFrame(rows).astype({"runs": "Int64"})
 
 
 def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
-    """Return the sections of the report: a list of verdicts, then a section for each claim.
-
-    `claims` are the claims by name, and `numbers` is the table of findings that `table`
-    returns.
-    """
+    """Return the sections of the report: a list of verdicts, then a section for each claim."""
     verdicts = numbers.drop_duplicates("claim")[["statement", "verdict"]]
     report = [Section("", [NOTE], verdicts.rename(columns={"statement": "claim"}))]
     for name, rows in numbers.groupby("claim", sort=False):
@@ -165,9 +157,9 @@ def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
 
 
 def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return findings as a table of text with the columns of the report.
+    """Return findings about a claim as a table of texts with the columns of the report.
 
-    `rows` are those rows of the table that `table` returns that have a measured number.
+    `rows` are the rows of the claim in the table that the function `table` returns.
     """
     low = rows["low"].map(_three_digits)
     high = rows["high"].map(_three_digits)
@@ -184,7 +176,8 @@ def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
 def _three_digits(value: float) -> str:
     """Return a number as text with about three digits.
 
-    Infinity, the time of an event that did not happen, is "never"; minus infinity is "?".
+    The text of infinity is "never", since the time of an event that did not happen is infinite.
+    The text of minus infinity, an unknown lower end of an interval, is "?".
     """
     if isinf(value):
         return "never" if value > 0 else "?"

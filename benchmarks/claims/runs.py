@@ -13,9 +13,10 @@ from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 Array = NDArray[np.floating]
 
 PAPER_NODES = 3  # number of hidden nodes of the paper's network
-PAPER_LENGTH = 3  # number of set points, and of errors, among the inputs of the paper's network
-# Weights have converged if their distance from their final values is at most this share of the
-# distance at the start of the run, for at least this many samples at the end of the run.
+PAPER_LENGTH = 3  # number of latest set points, and of latest errors, as the network's inputs
+# The weights of a network have converged if, for at least `CONVERGED_SAMPLES` samples at the
+# end of a run, their distance from their final values is at most `CONVERGED_SHARE` times the
+# distance at the start of the run.
 CONVERGED_SHARE = 0.05
 CONVERGED_SAMPLES = 100
 
@@ -25,7 +26,7 @@ class Batch:
     """A batch of independent runs of controllers on plants."""
 
     runs: int  # number of runs
-    seed: int = 0  # run i has the initial weights and the noise of the seed `seed + i`
+    seed: int = 0  # seed of the first run; run i has the seed `seed + i`
 
     def networks(
         self,
@@ -35,20 +36,21 @@ class Batch:
         in_proportion: bool = False,
         direction: int = -1,
     ) -> DirectNNController:
-        """Return learning networks, one for each run of the batch; by default, the paper's.
+        """Return a learning network for each run of the batch, by default the paper's network.
 
         Parameters
         ----------
         nodes
             Number of hidden nodes.
         length
-            Number of set points, and of errors, among the inputs of a network.
+            Number of latest set points, and number of latest errors, that each network
+            observes.
         in_proportion
-            Whether a network with n times the nodes or inputs of the paper's network has 1 / n
-            of the paper's learning rates. With equal learning rates, a larger network learns
+            Whether to divide the paper's learning rates by n if a network has n times the nodes
+            or inputs of the paper's network. With equal learning rates, a larger network learns
             faster, as more terms of a sum change at the same time.
         direction
-            The sign of the plant's gain that a network assumes: -1, or 1 for the wrong sign.
+            Sign of the plant's gain that each network assumes: -1 (right) or 1 (wrong).
         """
         node_scale = 1.0
         input_scale = 1.0
@@ -75,34 +77,23 @@ class Batch:
         before: Callable[[int], object] | None = None,
         **arguments: Any,
     ) -> Trajectory:
-        """Run a controller on a plant for each run of the batch, and return the trajectory.
+        """Run a controller on one plant for each run of the batch, and return all signals.
 
-        Parameters
-        ----------
-        agent
-            The controller, for all runs of the batch.
-        samples
-            Length of a run, in samples.
-        before
-            Function that is called with k before the controller acts at sample k.
-        **arguments
-            Arguments of the environment.
+        `samples` is the length of a run, and `arguments` are arguments of the environment. The
+        function `before` is called with the number k of each sample before the controller acts.
         """
         plants = make_plants(self.runs, samples, **arguments)
         return rollout(plants, agent, samples, self.seed, before)
 
     def run_nn(self, samples: int, **arguments: Any) -> Trajectory:
-        """Run the paper's network, and return the trajectory of all runs of the batch.
-
-        `samples` is the length of a run, and `arguments` are arguments of the environment.
-        """
+        """Run the paper's network, and return the signals of all runs of the batch."""
         return self.run(self.networks(), samples, **arguments)
 
     def run_pi(self, gains: Mapping[str, float], samples: int, **arguments: Any) -> Trajectory:
-        """Run a PI controller with the gains `kp` and `ki`, and return the trajectory.
+        """Run a PI controller with the gains `kp` and `ki`, and return the signals of all runs.
 
-        Without the argument `noise_variance`, all runs would be equal, so there is one run.
-        `samples` is the length of a run, and `arguments` are arguments of the environment.
+        If `arguments` does not contain `noise_variance`, all runs of the batch would be equal,
+        so that the controller runs only once.
         """
         batch = self if "noise_variance" in arguments else Batch(1, self.seed)
         return batch.run(PIController(gains["kp"], gains["ki"]), samples, **arguments)
@@ -110,10 +101,11 @@ class Batch:
 
 @dataclass
 class WeightLog:
-    """A log of the weights of learning networks, to be called before each sample of a run."""
+    """A function that logs the weights of learning networks before each sample of a run."""
 
     networks: DirectNNController  # a batch of networks, one for each run
-    weights: list[Array] = field(default_factory=list)  # by sample, each (runs, weights)
+    # An array for each sample, shape (runs, weights).
+    weights: list[Array] = field(default_factory=list)
 
     def __call__(self, k: int) -> None:
         """Append the weights of all networks before they act at sample k."""
@@ -123,22 +115,22 @@ class WeightLog:
 
 
 def converged_at(weights: Array) -> Array:
-    """Return the sample from which on the weights of each run have converged, shape (runs,).
+    """Return the sample at which the weights of each run have converged, shape (runs,).
 
-    The weights have converged at a sample if, from this sample on, their Euclidean distance
-    from their final values is at most `CONVERGED_SHARE` times the distance at the start. If
-    they come this close to their final values only in the last `CONVERGED_SAMPLES` samples,
-    they may still be moving when the run ends, and the result is infinite.
+    The weights have converged at the first sample from which on their Euclidean distance from
+    their final values is at most `CONVERGED_SHARE` times the distance at the start of the run.
+    The result is infinite for a run whose weights converge less than `CONVERGED_SAMPLES`
+    samples before the end of the run, since these weights may still be changing when the run
+    ends.
 
-    Parameters
-    ----------
-    weights
-        The weights of the networks before each sample, shape (samples, runs, weights).
+    `weights` has the weights of the networks before each sample, shape (samples, runs,
+    weights).
     """
     samples = len(weights)
     distances = np.linalg.norm(weights - weights[-1], axis=2)
     is_outside = distances > CONVERGED_SHARE * distances[0]
-    # Backwards in time, the first sample outside follows all samples that have converged.
+    # In reversed time, the index of the first sample outside is the number of converged
+    # samples.
     converged_samples = np.argmax(is_outside[::-1], axis=0)
     first_converged = np.where(is_outside.any(axis=0), samples - converged_samples, 0)
     is_long_enough = first_converged <= samples - CONVERGED_SAMPLES

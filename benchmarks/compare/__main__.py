@@ -51,10 +51,10 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Run a comparison, write the results, and return a sentence that says where they are.
+    """Compare controllers, write the results, and return a sentence that names their folder.
 
-    If tasks fail or the user interrupts the comparison, the results of the tasks that have
-    finished are written before the exception is raised again.
+    If a task fails or the user interrupts the comparison, the results of all finished tasks are
+    written before the exception is raised again.
     """
     from benchmarks.compare.comparison import run_case, scale_of
     from benchmarks.compare.report import write
@@ -67,7 +67,7 @@ def work(options: Options) -> str:
     folder_name, scenarios = cases(options)
     target = options.out or Path("results", folder_name)
     provenance = origin()
-    # The tasks by name, such as "bounds of square" and "mpc, square".
+    # Names of tasks are, for example, "bounds of square" and "mpc, square".
     bound_tasks: dict[str, Any] = {}
     run_tasks: dict[str, Any] = {}
     for scenario in scenarios:
@@ -107,9 +107,10 @@ def work(options: Options) -> str:
 
 
 def cases(options: Options) -> tuple[str, list[Scenario]]:
-    """Return the name of the default folder in `results/`, and the scenarios to run.
+    """Return the name of the default output folder in `results/`, and the scenarios to run.
 
-    A `UsageError` is raised if the options cannot be combined or name an unknown scenario.
+    A `UsageError` is raised if `options` has options that exclude each other, or the name of an
+    unknown scenario.
     """
     if options.presets and options.plant.name:
         raise UsageError("--presets cannot be combined with --plant, --preset and --set")

@@ -1,12 +1,12 @@
-"""Find controllers that act before a square wave changes, and score them in other runs.
+"""Find controllers that anticipate a square wave, and score these at random set points.
 
-A controller anticipates if it acts before a change of the set point. A policy that was trained
-with random set points can learn to expect a change after half a period of the square wave, as
-this is the longest time for which a random set point is constant. On the square wave, a policy
-that expects the changes can have a smaller mean error than the best controller without
-foresight. Since foresight is no skill in control, a report marks controllers that anticipate,
-and scores them in surprising runs: runs with the same seeds, in which nobody can foresee when
-the set point changes.
+A controller anticipates if the controller acts before a change of the set point. Random set
+points are constant for at most half a period of the square wave, so that a policy that was
+trained with random set points can learn to expect a change after half a period. On the square
+wave, a policy that expects the changes can have a smaller mean error than the best controller
+without foresight. Since foresight is no skill in control, a report marks controllers that
+anticipate, and scores the marked controllers in runs in which nobody can foresee when the set
+point changes.
 """
 
 import itertools
@@ -24,34 +24,34 @@ from benchmarks.loop.scenarios import Scenario
 
 Array = NDArray[np.float64]
 
-# A controller counts as one that anticipates if the temperature makes at least this share of a
-# set-point change before it can respond to the change.
+# A controller anticipates if the temperature makes at least the share `LEAST_MOVEMENT` of a
+# set-point change before the temperature can respond to the change.
 LEAST_MOVEMENT = 0.05
-# Number of timetables, which say when the set point changes in surprising runs. As the least
-# possible error takes long to compute, a tenth of the runs has the same timetable.
+# Number of different unforeseeable set points. As the least possible error for a set point
+# takes long to compute, a tenth of the runs has the same set point.
 TIMETABLES = 10
-TIMETABLE_SEED = 0  # of the random times in the first timetable, not of an episode
+TIMETABLE_SEED = 0  # seed of the first unforeseeable set point, not of an episode
 
 
 @dataclass(frozen=True)
 class Anticipation:
-    """How much a controller anticipates on a square wave, and its errors in surprising runs.
+    """How much a controller anticipates, and the controller's errors without foresight.
 
-    In surprising runs, nobody can foresee when the set point changes. The error of a run is the
-    mean of |e|, the absolute error, over the samples.
+    The errors are mean absolute errors of runs in which nobody can foresee the set point.
 
     Attributes
     ----------
     movement : Estimate
-        On the square wave: the share of a set-point change that the output has made before the
-        output can respond to the change.
+        Share of a set-point change of the square wave that the output makes before the output
+        can respond to the change.
     errors : Array
-        Errors of the controller in surprising runs, degC, shape (members, runs). The members
-        are the trained networks of the controller.
+        Mean absolute errors of the controller in runs with unforeseeable set points, degC,
+        shape (members, runs). A controller has a member for each trained network.
     least : float
-        Least possible error in surprising runs without foresight, degC, a mean over the runs.
+        Least possible error at unforeseeable set points, degC, a mean over the runs.
     idle : float
-        Error of an idle valve in surprising runs, degC, a mean over the runs.
+        Error of an idle valve (a flow of 0 t/h) at unforeseeable set points, degC, a mean over
+        the runs.
     """
 
     movement: Estimate
@@ -61,14 +61,14 @@ class Anticipation:
 
     @property
     def ratio(self) -> float:
-        """Mean error in surprising runs, divided by the least possible error in these runs."""
+        """Mean error at unforeseeable set points, divided by the least possible error."""
         return float(self.errors.mean() / self.least)
 
     @property
     def scores(self) -> Array:
-        """Score of each surprising run, shape (members, runs).
+        """Score of each run with an unforeseeable set point, shape (members, runs).
 
-        The score is 0 for the error of an idle valve, and 1 for the least possible error.
+        A score is 0 for the error of an idle valve, and 1 for the least possible error.
         """
         return (self.idle - self.errors) / (self.idle - self.least)
 
@@ -82,28 +82,21 @@ def anticipation(
 ) -> Anticipation | None:
     """Return how much a controller anticipates the changes of a square wave.
 
-    If the controller does not act before the changes, or the set point is no square wave, the
-    result is None. Otherwise, the controller runs again, with set points whose changes nobody
-    can foresee.
+    A controller that acts before the changes runs again with set points whose changes nobody
+    can foresee. The result is None if the controller does not act before the changes, or the
+    set point of the scenario is not a square wave.
 
-    Parameters
-    ----------
-    members
-        The records of the controller's members, one for each trained network.
-    trajectories
-        The signals of each member's runs in the scenario. If all runs of a member are equal,
-        the signals are those of a single run.
-    runs
-        Number of runs of a member.
-    seed
-        Seed of the first run; run i has the seed `seed + i`.
+    `members` has a record of the controller for each trained network, and `trajectories` has
+    the signals of each member in the scenario. Each member has `runs` runs, but the trajectory
+    has a single run if all runs are equal. Run i has the seed `seed + i`.
     """
     if scenario.parameters.setpoint != "square":
         return None
     movement = movement_before_changes(scenario, trajectories)
     if movement is None or movement.low <= 0.0 or movement.value < LEAST_MOVEMENT:
         return None
-    # The output of an unstable loop moves at all times, and anticipates nothing.
+    # A controller with an unstable loop changes the temperature at all times, but does not
+    # anticipate.
     if not follows_setpoint(trajectories):
         return None
     seeds = np.arange(seed, seed + runs)
@@ -112,7 +105,7 @@ def anticipation(
 
 
 def follows_setpoint(trajectories: Sequence[Trajectory]) -> bool:
-    """Return whether the mean error is smaller than that of an output that stays at 0 degC."""
+    """Return whether the mean |error| is smaller than with an output of always 0 degC."""
     errors = np.concatenate([np.abs(batch.next_error).ravel() for batch in trajectories])
     setpoints = np.concatenate([np.abs(batch.setpoint).ravel() for batch in trajectories])
     return bool(errors.mean() < setpoints.mean())
@@ -121,23 +114,21 @@ def follows_setpoint(trajectories: Sequence[Trajectory]) -> bool:
 def movement_before_changes(
     scenario: Scenario, trajectories: Sequence[Trajectory]
 ) -> Estimate | None:
-    """Return how far the output moves to a new set point before it can respond to the change.
+    """Return how far the output moves to a new set point before a response is possible.
 
-    The result is a share of the set-point change, a mean over all changes. The result is None
-    if the set point changes too often for the following comparison.
+    The movement is a share of the set-point change, as a mean over all changes. The result is
+    None if the set point changes too often for measuring the movement.
 
-    With the delay d of the plant, in samples, a flow changes the output d + 1 samples later. So
-    the output in the first d + 1 samples after a set-point change does not depend on what the
-    controller does at the change or later. The mean output in these d + 1 samples is compared
-    with the mean output in a window of d + 1 samples before the change. The window lies between
-    a quarter and three quarters of the time for which the old set point is constant. Of all
-    windows in this time, the comparison takes the window in which the output, a mean over all
-    runs, is nearest to the new set point. Hence a controller whose output oscillates around the
-    set point, or has not reached the set point, does not count as a controller that
-    anticipates.
+    In a plant with a delay of d samples, a flow first affects the output d + 1 samples later.
+    Hence the output in the first d + 1 samples after a set-point change does not depend on the
+    flows at or after the change. The movement is the mean output in the d + 1 samples after the
+    change, minus the mean output in a window of d + 1 samples before the change. Of all windows
+    between a quarter and three quarters of the time for which the old set point is constant,
+    the movement uses the window in which the mean output is nearest to the new set point. A
+    controller whose output oscillates around the old set point, or has not reached the old set
+    point, has little or no movement, and does not count as a controller that anticipates.
 
-    The scenario has a square wave, and `trajectories` has the signals of the runs of each
-    member of the controller.
+    `scenario` has a square wave, and `trajectories` has the signals of each member's runs.
     """
     window = int(scenario.parameters.range_of("delay")[0]) + 1
     setpoint = trajectories[0].setpoint[:, 0]
@@ -169,19 +160,10 @@ def run_surprised(
 ) -> Anticipation:
     """Run a controller with set points that nobody can foresee, and return the errors.
 
-    Parameters
-    ----------
-    scenario
-        A scenario with a square wave, which gives the plant of the surprising runs.
-    members
-        The records of the controller's members, one for each trained network.
-    movement
-        The result of `movement_before_changes`, which becomes part of the returned object.
-    seeds
-        The seeds of the runs, shape (runs,).
-    are_equal
-        Whether nothing but the set point differs between runs, so that one run of each member
-        with each set point is enough.
+    `scenario` has a square wave, `members` are the records of the controller's members,
+    `movement` is the result of `movement_before_changes`, and `seeds` has the shape (runs,).
+    If `are_equal` is true, runs with the same set point are equal, so that each member runs
+    only once with each set point.
     """
     errors = []
     least_errors: list[float] = []
@@ -195,8 +177,8 @@ def run_surprised(
         arguments = {**scenario.arguments, "setpoint": setpoint}
         errors_of_group = []
         for member in members:
-            # The controller is made for the scenario with the square wave, so that it cannot
-            # know the timetable.
+            # The controller is made for the square wave, so that the controller cannot know the
+            # times of the set-point changes.
             controller = member.make(scenario.arguments, simulated_runs, first_seed)
             trajectory = member.run(
                 arguments, scenario.samples, simulated_runs, first_seed, controller
@@ -219,10 +201,11 @@ def run_surprised(
 def surprising_setpoint(scenario: Scenario, seed: int) -> list[float]:
     """Return a set point whose changes nobody can foresee, degC, one number for each sample.
 
-    The set point has the two values of the scenario's square wave, in turn, and stays at each
-    value for half a period of the square wave on average. From a quarter of the period after a
-    change on, the set point changes at each sample with the same probability. So the time since
-    a change does not show when the next change comes. `seed` is the seed of the random times.
+    The set point alternates between the two values of the scenario's square wave, and has each
+    value for half a period of the square wave on average. When a quarter of the period has
+    passed after a change, the set point changes at each sample with the same probability, so
+    that the time since the last change does not tell when the next change comes. `seed` is the
+    seed of the random times of the changes.
     """
     generator = np.random.default_rng(seed)
     parameters = scenario.parameters

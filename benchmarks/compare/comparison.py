@@ -1,4 +1,4 @@
-"""Run controllers in scenarios, and compare their errors with the least possible errors.
+"""Run controllers in scenarios, and compare the errors with the least possible errors.
 
 A scenario is a plant, a set point and a length of the runs. The error of a run is the mean of
 |e|, the absolute error, over the samples of the run.
@@ -26,7 +26,7 @@ from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES
 
-BOOTSTRAP_SEED = 0  # of the resampling for confidence intervals, not of an episode
+BOOTSTRAP_SEED = 0  # seed of the resampling for confidence intervals, not of an episode
 
 # The anticipation of each controller that acts before a square wave changes, by the name of the
 # scenario and the name of the controller.
@@ -37,26 +37,26 @@ Anticipations = Mapping[tuple[str, str], Anticipation]
 class Result:
     """The results of one controller in one scenario.
 
-    A controller with several trained networks has one member for each network, and each member
-    has its own runs.
+    A controller has a member for each trained network, and each member has its own runs.
 
     Attributes
     ----------
     scenario : str
         Name of the scenario.
     agent : str
-        Name of the controller in options.
+        Name of the controller in options, such as "mpc".
     runs : pandas.DataFrame
-        A row for each run of each member. The columns are `scenario`, `agent`, `policy` (the
-        number of the member), `seed`, and the measures of `benchmarks.loop.rollout.measure`.
+        Table with a row for each run of each member, and the columns `scenario`, `agent`,
+        `policy` (the number of the member), `seed`, and the measures that
+        `benchmarks.loop.rollout.measure` returns.
     responses : pandas.DataFrame
-        A row for each sample of time, as `responses_over_time` returns it.
+        Table of temperature and flow with a row for each sample, from `responses_over_time`.
     policies : sequence of mapping
-        The origins of the trained networks, one for each member that was trained.
+        Provenance of each trained network of the controller.
     seconds : float
         Processor time of the runs, s.
     anticipation : Anticipation, optional
-        How much the controller anticipates, if it acts before a square wave changes.
+        How much the controller anticipates; None if the controller does not anticipate.
     """
 
     scenario: str
@@ -71,15 +71,10 @@ class Result:
 def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: int) -> Result:
     """Run all members of a controller in a scenario, and return the results.
 
-    If neither the scenario nor the controller uses random numbers, all runs of a member are
-    equal, so that the member runs once, and the results have a copy of this run for each seed.
+    If neither the scenario nor the controller uses random numbers, each member runs only once,
+    and the results have a copy of this run for each seed.
 
-    Parameters
-    ----------
-    runs
-        Number of runs of each member.
-    seed
-        Seed of the first run; run i has the seed `seed + i`.
+    `runs` is the number of runs of each member, and run i has the seed `seed + i`.
     """
     start = time.process_time()
     members = controller.members()
@@ -116,14 +111,11 @@ def responses_over_time(
 ) -> pd.DataFrame:
     """Return a table of a controller's temperature and flow over time, one row for each sample.
 
-    The columns are `agent`, `sample`, `time_s` (s), `setpoint` (degC), and four columns each
-    for the temperature, `output_...` (degC), and the applied flow, `applied_...` (t/h): `run`
-    is the first run, and `median`, `p10` and `p90` are percentiles over all runs of all
-    members. If the set points are random, the percentiles are those of the first run alone, as
-    the runs have different set points.
-
-    `trajectories` has the signals of a batch of runs for each member of the controller, and
-    `agent` is the name of the controller in options.
+    The columns are `agent`, `sample`, `time_s` (s) and `setpoint` (degC); `output_run` (degC)
+    and `applied_run` (t/h), the temperature and the applied flow of the first run; and the
+    percentiles `output_median`, `output_p10`, `output_p90`, `applied_median`, `applied_p10` and
+    `applied_p90` over all runs of all members. If the set points are random, the runs have
+    different set points, and the percentiles are the values of the first run.
     """
     setpoint = trajectories[0].setpoint[:, 0]
     k = np.arange(len(setpoint))
@@ -134,8 +126,8 @@ def responses_over_time(
         columns[f"{signal}_run"] = values[:, 0]
         if scenario.parameters.setpoint == "random":
             values = values[:, :1]
-        # The method "nearest" returns values that occurred: an interpolated percentile of the
-        # applied flow could lie in the dead zone.
+        # The method "nearest" returns a percentile that occurred in a run. An interpolated
+        # percentile of the applied flow could lie in the dead zone.
         for name, percentile in percentiles(values, "nearest").items():
             columns[f"{signal}_{name}"] = percentile
     return pd.DataFrame(columns)
@@ -143,15 +135,15 @@ def responses_over_time(
 
 @dataclass(frozen=True)
 class Scale:
-    """The least possible errors with which a report compares the errors in a scenario.
+    """The least possible errors in a scenario, with and without known future set points.
 
     Attributes
     ----------
     scenario : Scenario
     least : LeastPossible
-        The least possible error of a controller that does not know future set points.
+        Least possible error of a controller that does not know future set points.
     preview : float
-        The least possible error of a controller that knows all future set points, degC.
+        Least possible error of a controller that knows all future set points, degC.
     """
 
     scenario: Scenario
@@ -162,18 +154,13 @@ class Scale:
 def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     """Return the least possible errors in a scenario, as means over episodes.
 
-    Parameters
-    ----------
-    runs
-        Number of runs of a controller. The means are over the episodes of all runs, but at most
-        over the first `EPISODES` episodes, as bounds take long to compute.
-    seed
-        Seed of the first run; run i has the seed `seed + i`.
+    As bounds take long to compute, the means are over the first `runs` episodes, but at most
+    over `EPISODES` episodes. Episode i has the seed `seed + i`.
 
     Raises
     ------
     ValueError
-        If no controller can have a smaller error than an idle valve.
+        If no controller can have a smaller error in `scenario` than an idle valve.
     """
     arguments = {
         "samples": scenario.samples,
@@ -182,7 +169,8 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
         **scenario.arguments,
     }
     least = least_possible(**arguments)
-    least.score(0.0)  # This raises a ValueError if an idle valve is as good as any controller.
+    # The method `score` raises a ValueError if an idle valve is as good as any controller.
+    least.score(0.0)
     preview = least_possible(kind="preview", **arguments)
     return Scale(scenario, least, preview.value)
 
@@ -195,32 +183,35 @@ def estimate(
     Parameters
     ----------
     runs : pandas.DataFrame
-        A row for each run, with the columns `scenario`, `agent` (the controller), `policy` (the
-        number of the member), `seed` and `mae` (the error of the run, degC). The controller in
-        the first row is the reference for differences.
+        Table with a row for each run, and the columns `scenario`, `agent` (the controller),
+        `policy` (the number of the controller's member), `seed` and `mae` (the mean absolute
+        error of the run, degC). The controller in the first row is the reference with which all
+        other controllers are compared.
     scales : mapping
-        The least possible errors of each scenario, by the scenario's name. Scenarios without
-        least possible errors are left out.
+        Least possible errors by the name of the scenario. A scenario that is not in `scales` is
+        left out of the result.
     anticipations : mapping
-        The anticipation of each controller that acts before a square wave changes.
+        `Anticipation` by the names of scenario and controller, if the controller anticipates.
 
     Returns
     -------
     pandas.DataFrame
-        A row for each scenario and controller, with the columns `scenario`, `agent` and:
+        Table with a row for each scenario and controller, and these columns in addition to
+        `scenario` and `agent`:
 
         - `limit` and `preview`: the least possible errors without and with knowledge of future
           set points, degC;
-        - `mean`: the mean error over the runs, degC, an `Estimate`. If random numbers are used
-          and there is only one run, the ends of the interval are infinite;
+        - `mean`: the mean error over the runs, degC, an `Estimate`. If runs use random numbers
+          and the table has only one run, the ends of the confidence interval are infinite;
         - `ratio`: the error ratio, which is `mean` divided by `limit`, an `Estimate`;
         - `scores`: an array with the score of each run, shape (members, runs). If the
-          controller anticipates, the scores are those in surprising runs;
+          controller anticipates, the scores are from runs with unforeseeable set points;
         - `mark`: "‡" if the controller anticipates, and otherwise "";
-        - `difference`: the mean over the runs of the error minus the error of the reference in
-          the same run, degC, an `Estimate`;
-        - `improvement`: the share of the runs in which the error is smaller than the error of
-          the reference, an `Estimate`. A run with equal errors counts as half a run.
+        - `difference`: the mean over the runs of the controller's error minus the reference's
+          error in the same run, degC, an `Estimate`;
+        - `improvement`: the share of the runs in which the controller's error is smaller than
+          the reference's error, an `Estimate`. A run in which both controllers have equal
+          errors counts as half a run.
     """
     reference = runs["agent"].iloc[0]
     rows = []
@@ -256,9 +247,9 @@ def estimate(
 
 
 def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
-    """Return an array of errors for each controller, degC, shape (members, runs), by name.
+    """Return the errors of each controller, degC, shape (members, runs), by controller name.
 
-    `runs` has the rows of one scenario, as in `Result`.
+    `runs` has the rows of one scenario in the table `Result.runs`.
     """
     errors = {}
     for agent, rows in runs.groupby("agent", sort=False):
@@ -270,10 +261,9 @@ def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
 def misfits_of(
     controllers: Mapping[str, ControllerSpec], plants: Sequence[Parameters]
 ) -> dict[str, str]:
-    """Return a sentence for each controller that does not fit all plants, by controller.
+    """Return a sentence for each controller that does not fit all plants, by controller name.
 
-    The sentence says why the controller does not fit the first plant that it does not fit.
-    `controllers` are records by name, and `plants` are the plants of all scenarios.
+    The sentence gives the reason for the first plant that the controller does not fit.
     """
     misfits: dict[str, str] = {}
     for name, controller in controllers.items():
@@ -287,8 +277,8 @@ def ranked(estimates: pd.DataFrame, misfits: Collection[str]) -> dict[str, Estim
     """Return the overall score of each controller by name, the highest score first.
 
     The overall score is the mean score over all scenarios, members and runs, with the 95 %
-    confidence interval of `bootstrap`. `estimates` is the table that `estimate` returns. The
-    controllers in `misfits`, which do not fit all plants, come last.
+    confidence interval of `bootstrap`. The controllers in `misfits`, which do not fit all
+    plants, come last in the result.
     """
     scores = {
         str(agent): bootstrap(*tables, seed=BOOTSTRAP_SEED)
@@ -298,11 +288,11 @@ def ranked(estimates: pd.DataFrame, misfits: Collection[str]) -> dict[str, Estim
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return percentiles of the measures of runs, such as the error, over the runs.
+    """Return percentiles over runs of measures such as the mean error and the valve travel.
 
-    There is a row for each scenario, controller and measure, with the columns `scenario`,
-    `agent`, `metric` (the name of the measure), `runs` (the number of runs), `median`, `p10`
-    and `p90`. The argument `runs` has a row for each run, as in `Result`.
+    The returned table has a row for each scenario, controller and measure, with the columns
+    `scenario`, `agent`, `metric` (the name of the measure), `runs` (the number of runs),
+    `median`, `p10` and `p90`. The argument `runs` is a table like `Result.runs`.
     """
     measures = runs.columns.drop(["scenario", "agent", "policy", "seed"])
     rows = []
@@ -316,15 +306,16 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 def write_numbers(path: Path, table: pd.DataFrame) -> None:
     """Write a table of numbers, texts and objects of class `Estimate` to the CSV file `path`.
 
-    A column of estimates becomes three columns: NAME has the values, and NAME_low and NAME_high
-    have the ends of the intervals, with empty cells for infinite ends. Infinity in any other
-    column, which is the settling time of a run that does not settle, becomes "not settled".
+    A column NAME of estimates becomes three columns: NAME has the values, and NAME_low and
+    NAME_high have the ends of the confidence intervals. An infinite end of an interval becomes
+    an empty cell. The infinite settling time of a run that does not settle becomes "not
+    settled".
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():
         if any(isinstance(cell, Estimate) for cell in cells):
             for field, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
-                # A cell without an estimate is NaN, and has no such attribute.
+                # A cell without an estimate is NaN, which does not have the attribute.
                 numbers = pd.Series([getattr(cell, field, math.nan) for cell in cells])
                 columns[f"{name}{suffix}"] = numbers.replace([math.inf, -math.inf], math.nan)
         else:

@@ -23,8 +23,8 @@ from benchmarks.lib.statistics import Estimate, as_text
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 
-# The ends of the axis of scores, which is logarithmic in 1 minus the score, so that it cannot
-# reach 1. Scores beyond an end are drawn at the end.
+# The ends of the axis of scores. The axis is logarithmic in 1 minus the score, so that a score
+# of 1 would lie at infinity. A score beyond an end of the axis is drawn at the end.
 LOWEST_SCORE = -0.5
 HIGHEST_SCORE = 0.999
 SCORE_TICKS = LOWEST_SCORE, 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, HIGHEST_SCORE
@@ -40,15 +40,15 @@ BAND: Any = {"alpha": 0.3, "linewidth": 0}
 def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: Path) -> None:
     """Draw the scores of controllers: a row for each controller, on a common axis of scores.
 
-    A row has a large marker at the overall score of the controller, and a small tick at the
+    Each row has a large marker at the overall score of the controller, and a small tick at the
     controller's score in each scenario.
 
     Parameters
     ----------
     scores : mapping
-        The overall score of each controller by name, the highest score first.
+        Overall score of each controller by name, the highest score first.
     estimates : pandas.DataFrame
-        The table of `comparison.estimate`.
+        The table that `comparison.estimate` returns.
     path : Path
         The PNG file.
     """
@@ -79,10 +79,7 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
 
 
 def scores_finding(scores: Mapping[str, Estimate]) -> str:
-    """Return the title of the picture of scores, which names the highest and lowest scores.
-
-    `scores` has the overall score of each controller by name, the highest score first.
-    """
+    """Return the title of the picture of scores, which names the highest and lowest scores."""
     names = [label(agent) for agent in scores]
     values = [as_text(score.value, ".3f") for score in scores.values()]
     if len(scores) == 1:
@@ -94,9 +91,10 @@ def scores_finding(scores: Mapping[str, Estimate]) -> str:
 
 
 def distance(scores: ArrayLike) -> NDArray[np.float64]:
-    """Return 1 minus each score, for the logarithmic axis of scores; shape as `scores`.
+    """Return 1 minus each score, an array of the shape of `scores`, for a logarithmic axis.
 
-    A score below `LOWEST_SCORE` or above `HIGHEST_SCORE` is first replaced by this limit.
+    A score below `LOWEST_SCORE` is replaced by `LOWEST_SCORE`, and a score above
+    `HIGHEST_SCORE` by `HIGHEST_SCORE`.
     """
     return 1.0 - np.clip(scores, LOWEST_SCORE, HIGHEST_SCORE)
 
@@ -104,9 +102,10 @@ def distance(scores: ArrayLike) -> NDArray[np.float64]:
 def scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
     """Make the x axis of a panel logarithmic in 1 minus the score, with scores at its ticks.
 
-    `scores` has all scores that are drawn. The axis reaches from the last of `SCORE_TICKS`
-    below all scores to the first tick above them. The label of the first or last of
-    `SCORE_TICKS` begins with `AT_MOST` or `AT_LEAST` if scores beyond it are drawn there.
+    The axis begins at the highest of `SCORE_TICKS` below all `scores`, and ends at the lowest
+    tick above all `scores`. If a score is below the first of `SCORE_TICKS`, the label of the
+    first tick begins with `AT_MOST`. If a score is above the last of `SCORE_TICKS`, the label
+    of the last tick begins with `AT_LEAST`.
     """
     labels = [f"{score:g}" for score in SCORE_TICKS]
     if min(scores) < LOWEST_SCORE:
@@ -132,17 +131,18 @@ def plot_responses(
     Parameters
     ----------
     responses : pandas.DataFrame
-        The table `responses` of `comparison.Result`, of all controllers to draw: a row for each
-        controller and sample.
+        The rows of all controllers to draw, from the tables `comparison.Result.responses`.
     errors : pandas.Series
-        Mean error of each controller in the scenario, degC, by the controller's name.
+        Mean error of each controller in the scenario, degC, by the name of the controller.
     scenario : Scenario
     path : Path
         The PNG file.
     """
     errors_drawn = errors[responses["agent"].unique()].sort_values(kind="stable")
     agents = list(errors_drawn.index)
-    styles = looks(list(errors.index))  # of all controllers, so that colours stay the same
+    # Colours are chosen for all controllers, drawn or not, so that each controller has the same
+    # colour in all pictures.
+    styles = looks(list(errors.index))
     title = f"{scenario.title}: {responses_finding(errors_drawn)}"
     height = 1.2 + 1.25 * len(agents)  # inches: title and legend, and the rows
     with open_picture(path, height, title) as figure:
@@ -169,8 +169,7 @@ def plot_responses(
 def responses_finding(errors: pd.Series[float]) -> str:
     """Return a clause of a title that compares the smallest and the largest mean error.
 
-    `errors` has the mean error of each controller, degC, by the controller's name, in rising
-    order.
+    `errors` has the mean error of each controller, degC, the smallest error first.
     """
     best = str(errors.index[0])
     worst = str(errors.index[-1])
@@ -181,10 +180,9 @@ def responses_finding(errors: pd.Series[float]) -> str:
 
 
 def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
-    """Draw the set point, the temperature of the first run, and a band of percentiles.
+    """Draw the set point, the temperature of the first run, and the 10th to 90th percentile.
 
-    `axes` is the panel of one controller, and `rows` are this controller's rows of the argument
-    `responses` of `plot_responses`.
+    `rows` are the rows of one controller in the argument `responses` of `plot_responses`.
     """
     minutes = rows["time_s"] / 60.0
     axes.fill_between(minutes, rows["output_p10"], rows["output_p90"], color=colour, **BAND)
@@ -196,9 +194,9 @@ def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
 def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -> None:
     """Draw the applied flow of the first run, the dead zone, and the limits of the flow.
 
-    `axes` is the panel of one controller, and `rows` are this controller's rows of the argument
-    `responses` of `plot_responses`. If the dead zone or a limit of the plant has a range, the
-    smallest dead zone or the widest limit is drawn.
+    `rows` are the rows of one controller in the argument `responses` of `plot_responses`. If
+    the dead zone of the plant has a range, the smallest dead zone is drawn. If a limit of the
+    flow has a range, the widest limit is drawn.
     """
     dead_zone = plant.range_of("dead_zone")[0]
     axes.axhspan(-dead_zone, dead_zone, **DEAD_ZONE)
@@ -210,7 +208,7 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
 
 
 def _legend_of_responses(responses: pd.DataFrame, plant: Parameters) -> dict[str, Any]:
-    """Return the lines and patches in the legend of `plot_responses`, by their texts."""
+    """Return the legend of `plot_responses`: matplotlib's lines and patches by text."""
     runs_differ = bool((responses["output_p90"] > responses["output_p10"]).any())
     run = Line2D([], [], color="black", linewidth=1.2)
     band = Patch(color="black", **BAND)

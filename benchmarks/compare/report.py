@@ -79,7 +79,7 @@ CASES_TEXT = (
 )
 MOST_PICTURED = 8  # largest number of controllers in a picture of responses over time
 MISFIT_MARK = "†"  # marks controllers that were made for another plant
-PARTS_OF_ERROR = {  # the columns of a part of the mean error, and of the mean error
+PARTS_OF_ERROR = {  # names of the parts of the mean error in CSV files and in the report
     "mae_start": f"first {START_SAMPLES} samples",
     "mae_changes": f"{RESPONSE_SAMPLES} samples after later changes",
     "mae_steady": "remaining samples",
@@ -91,27 +91,24 @@ PARTS_OF_ERROR = {  # the columns of a part of the mean error, and of the mean e
 class Comparison:
     """All results of a comparison that the report shows.
 
-    The scenarios are those whose least possible error has been computed.
-
     Attributes
     ----------
     controllers : mapping
-        The record of each controller by name.
+        Record of each controller by name.
     results : sequence of Result
-        The results of each controller in each scenario, as far as these tasks have finished.
+        Results of each controller in each scenario, from all tasks that have finished.
     scales : mapping
-        The least possible errors in each scenario, by the name of the scenario.
+        Least possible errors by the name of the scenario, for all scenarios of the report.
     runs : pandas.DataFrame
-        A row for each run in the scenarios, as in `comparison.Result`.
+        Table with a row for each run in each scenario, like `comparison.Result.runs`.
     estimates : pandas.DataFrame
-        A row for each scenario and controller, as `comparison.estimate` returns it.
+        Table with a row for each scenario and controller, from `comparison.estimate`.
     anticipations : mapping
-        The anticipation of each controller that acts before a square wave changes, by the names
-        of scenario and controller.
+        `Anticipation` by the names of scenario and controller, if the controller anticipates.
     misfits : mapping
         Sentences that say why a controller does not fit a plant, by the controller's name.
     scores : mapping
-        The overall score of each controller by name, the best first and the misfits last.
+        Overall score of each controller by name, in the order of the controllers in tables.
     """
 
     controllers: Mapping[str, ControllerSpec]
@@ -132,8 +129,9 @@ class Comparison:
     def pictured(self) -> list[str]:
         """The names of the controllers that are drawn over time, the best first.
 
-        They are the `ranked` controllers, or all controllers if none is ranked. If there are
-        more than `MOST_PICTURED`, they are only those whose record has `pictured` true.
+        The drawn controllers are the `ranked` controllers, or all controllers if none is
+        ranked. Of more than `MOST_PICTURED` controllers, only controllers whose record has
+        `pictured` true are drawn.
         """
         names = self.ranked or list(self.scores)
         chosen = [name for name in names if self.controllers[name].pictured]
@@ -151,9 +149,9 @@ def write(
 ) -> None:
     """Write the CSV files, pictures and report of a comparison, and print the main tables.
 
-    A scenario that is not in `scales`, since its least possible errors are missing, is in the
-    CSV files, but not in the report. `controllers` has the record of each controller by name,
-    and `origin` is the provenance of the results, as `provenance.origin` returns it.
+    A scenario whose least possible errors are not in `scales` is written to the CSV files, but
+    not to the report. `controllers` has the record of each controller by name, and `origin` is
+    the provenance of the results, as `provenance.origin` returns it.
     """
     runs = pd.concat([result.runs for result in results], ignore_index=True)
     write_numbers(folder / "runs.csv", runs)
@@ -196,7 +194,7 @@ def write(
 def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:
     """Draw PNG files of the scores, and of temperature and flow over time in each scenario.
 
-    `responses` has a table for each scenario, by its name, which joins the tables
+    `responses` has, by the name of the scenario, a table that joins the tables
     `Result.responses` of all controllers.
     """
     scores = {name: comparison.scores[name] for name in comparison.ranked}
@@ -206,12 +204,13 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
     for name, scale in comparison.scales.items():
         rows = responses[name]
         rows = rows[rows["agent"].isin(comparison.pictured)]
-        if not rows.empty:  # The tasks of all pictured controllers may have failed.
+        # If the tasks of all pictured controllers have failed, `rows` is empty.
+        if not rows.empty:
             plots.plot_responses(rows, errors[name], scale.scenario, folder / f"{name}.png")
 
 
 def sections(comparison: Comparison) -> list[Section]:
-    """Return the sections of the report, but no section with an empty table."""
+    """Return the sections of the report. A section with an empty table is left out."""
     reference = label(str(comparison.runs["agent"].iloc[0]))
     scenarios = [scale.scenario for scale in comparison.scales.values()]
     candidates = [
@@ -269,9 +268,9 @@ def sections(comparison: Comparison) -> list[Section]:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return sentences on controllers that are not ranked, or ranked by surprising runs.
+    """Return sentences on controllers that are not ranked, or are scored in other runs.
 
-    The notes of users' own controllers, such as on a missing environment, come first.
+    Notes on users' own controllers, such as a note on a missing environment, come first.
     """
     texts = {
         str(policy["note"])
@@ -290,10 +289,7 @@ def notes(comparison: Comparison) -> list[str]:
 
 
 def notes_on_cases(comparison: Comparison, scenarios: Sequence[Scenario]) -> list[str]:
-    """Return paragraphs that explain the table of cases, and name the pictured controllers.
-
-    `scenarios` are all scenarios of the report.
-    """
+    """Return paragraphs that explain the table of cases, and name the pictured controllers."""
     texts = [CASES_TEXT]
     if any("Figs" in scenario.title for scenario in scenarios):
         texts.append("Figs are the figures of the paper by Cui and Shin (1992).")
@@ -306,8 +302,8 @@ def notes_on_cases(comparison: Comparison, scenarios: Sequence[Scenario]) -> lis
 def score_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts with the scores and the mean valve travel of each controller.
 
-    The controllers have the order of their overall scores. A controller that does not fit the
-    plants is "not ranked".
+    The rows have the order of `Comparison.scores`. A controller that does not fit the plants
+    has the text "not ranked" in place of an overall score.
     """
     estimates = comparison.estimates
     agents = list(comparison.scores)
@@ -326,7 +322,7 @@ def ratio_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts with least possible errors and error ratios in each scenario.
 
     The first two rows have the least possible errors without and with knowledge of future set
-    points, degC. Each other row has the error ratios of a controller.
+    points, degC. Each row below the first two rows has the error ratios of one controller.
     """
     bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
     for name, scale in comparison.scales.items():
@@ -341,7 +337,7 @@ def ratio_table(comparison: Comparison) -> pd.DataFrame:
 def anticipation_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts on the controllers that act before a square wave changes.
 
-    There is a row for each scenario and controller in `comparison.anticipations`.
+    The table has a row for each scenario and controller in `comparison.anticipations`.
     """
     estimates = comparison.estimates
     rows = []
@@ -363,11 +359,11 @@ def anticipation_table(comparison: Comparison) -> pd.DataFrame:
 
 
 def difference_table(comparison: Comparison) -> pd.DataFrame:
-    """Return a table of texts that compares the errors with those of the reference controller.
+    """Return a table of texts that compares each controller with the reference controller.
 
-    A cell has the mean difference of the errors, degC, and the share of the runs in which the
-    error is smaller than that of the reference. If there is only one controller, the table is
-    empty.
+    A cell has the mean of the controller's error minus the reference's error, degC, and the
+    share of the runs in which the controller has the smaller error. If a comparison has only
+    one controller, the table is empty.
     """
     if "difference" not in comparison.estimates:
         return pd.DataFrame()
@@ -382,9 +378,8 @@ def difference_table(comparison: Comparison) -> pd.DataFrame:
 def table_by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
     """Return a table of texts, with a row for each controller and a column for each scenario.
 
-    `rows` has a row for each cell, with the columns `scenario` and `agent` (the controller).
-    `cells` has the texts of the cells in the order of `rows`. The rows of the result have the
-    order of `agents`.
+    `rows` has the columns `scenario` and `agent` (the controller), and `cells` has a text for
+    each row of `rows`. The rows of the returned table have the order of `agents`.
     """
     table = rows.assign(cell=cells).pivot(index="agent", columns="scenario", values="cell")
     table = table.loc[list(agents), rows["scenario"].unique()].fillna("").rename(index=label)
@@ -394,8 +389,8 @@ def table_by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.
 def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a table of texts with the parts of the mean error in the scenario `hard`, degC.
 
-    There is a column for each of `PARTS_OF_ERROR`, and a row for each controller, the smallest
-    mean error first. `runs` has a row for each run, as in `comparison.Result`.
+    The table has a column for each of `PARTS_OF_ERROR`, and a row for each controller, the
+    smallest mean error first.
     """
     means = runs[runs["scenario"] == "hard"].groupby("agent")[list(PARTS_OF_ERROR)].mean()
     texts = means.sort_values("mae").map("{:.3f}".format)
@@ -426,13 +421,14 @@ def costs_table(
 ) -> pd.DataFrame:
     """Return a table of texts on knowledge, robustness and costs, a row for each controller.
 
-    `results` has the processor times, and `controllers` the records of the controllers by name.
     The robustness of linear controllers is computed with the nominal plant of `scenario`.
+    `controllers` has the record of each controller by name.
     """
     rows = []
     for name, controller in controllers.items():
         own_results = [result for result in results if result.agent == name]
-        # The record of a user's own controller has no texts; its provenance may have them.
+        # The record of a user's own controller has no texts for the table. The provenance of
+        # the controller may have such texts.
         policies = [policy for result in own_results for policy in result.policies]
         provenance = policies[0] if policies else {}
         sensitivity, delays = robustness_texts(controller, scenario)
@@ -449,7 +445,7 @@ def costs_table(
 
 
 def robustness_texts(controller: ControllerSpec, scenario: Scenario) -> tuple[str, str]:
-    """Return two texts on the robustness of a controller's loop; two empty texts if unknown.
+    """Return two texts on the robustness of the loop of a controller with a plant.
 
     The first text is Ms, the maximum sensitivity of the loop with the nominal plant of the
     scenario, and the second text is the range of the delays, in samples, with which the loop is

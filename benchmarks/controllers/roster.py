@@ -1,7 +1,7 @@
 """List the controllers that the commands can run, as records of the class `ControllerSpec`.
 
 The commands `compare`, `sweep`, `tune` and `watch` can run each controller of the roster. The
-option `--agent NAME=MODULE:FACTORY` makes a record for a user's own controller.
+option `--agent NAME=MODULE:FACTORY` of a command makes a record for a user's own controller.
 """
 
 import itertools
@@ -40,7 +40,8 @@ from benchmarks.loop.rollout import Agent, IdleValve
 from mptc_gym import PRESETS, Parameters
 
 # Default ratio of the closed-loop time constant of Dahlin's controller to the plant's time
-# constant. The small ratio makes the loop fast; the filter time constant makes it robust.
+# constant. The small ratio makes the control loop fast; the filter time constant makes the
+# control loop robust.
 LAMBDA = 0.1
 # The colours and markers that a user's own controllers get in turn.
 OWN_LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d")
@@ -51,24 +52,17 @@ def with_bank(
 ) -> SelfTuningController:
     """Return a self-tuning controller, which selects the best of a bank of plant models.
 
-    Parameters
-    ----------
-    kind
-        The class of the controller.
-    widest_dead_zone
-        The largest half width of the dead zone that the plant can have, t/h. The controller
-        assumes this dead zone.
-    prior_knowledge
-        Other arguments of the class, as `benchmarks.controllers.spec.knowledge` returns them.
+    The controller assumes the dead zone `widest_dead_zone`, the largest half width of the dead
+    zone that the plant can have, t/h.
     """
     return kind(dead_zone=widest_dead_zone, **prior_knowledge)
 
 
 def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
-    """Return the paper's networks for a batch of runs, trained on a plant and then frozen.
+    """Return the paper's neural controller, trained on a plant and then frozen.
 
-    `parameters` are the arguments of the environment, `num_envs` is the number of runs, and the
-    initial weights of run i have the seed `seed + i`.
+    The controller has a network for each of `num_envs` runs. The initial weights of the network
+    of run i have the seed `seed + i`. `parameters` are the arguments of the environment.
     """
     controller: Any = ROSTER["nn"].in_service(asdict(parameters), num_envs, seed)
     controller.learning = False
@@ -78,9 +72,9 @@ def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
 def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
     """Return Dahlin's controller for a plant.
 
-    `time_constant` is the plant's time constant, s, and `arguments` are the other arguments of
-    `DahlinController`. The default of `closed_loop_time_constant` is `LAMBDA` times the plant's
-    time constant.
+    `time_constant` is the time constant of the plant, s, and `arguments` are all further
+    arguments of `DahlinController`. The default of `closed_loop_time_constant` is `LAMBDA`
+    times the plant's time constant.
     """
     arguments.setdefault("closed_loop_time_constant", LAMBDA * time_constant)
     return DahlinController(time_constant=time_constant, **arguments)
@@ -89,18 +83,10 @@ def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
 def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -> Agent:
     """Return a trained policy, adapted to the actuator of a plant.
 
-    The returned policy has the limits of the plant. If it compensates a dead zone, it
-    compensates the dead zone of the plant in place of the dead zone in its training, unless the
-    dead zone of the plant has a range.
+    The returned policy has the flow limits `u_min` and `u_max` (t/h) of the argument `limits`.
+    A policy that compensates the dead zone of the plants of the training compensates the dead
+    zone of `parameters` instead, unless this dead zone has a range.
 
-    Parameters
-    ----------
-    parameters
-        The arguments of the environment.
-    network
-        The trained policy.
-    limits
-        `u_min` and `u_max`, the limits of the actuator, t/h.
     """
     increments = network.increments
     dead_zone = parameters.dead_zone
@@ -110,16 +96,16 @@ def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -
 
 
 def trained(kind: type[PolicyNetwork | RecurrentNetwork], files: str) -> Mapping[str, Any]:
-    """Return trained networks of the class `kind`, by the names of their files.
+    """Return trained networks of the class `kind`, by the name of the network's file.
 
-    The files are those in the folder `agents/pretrained` whose names match the pattern `files`,
-    such as "ppo-*.npz".
+    The files lie in the folder `agents/pretrained`, and have names that match the pattern
+    `files`, such as "ppo-*.npz".
     """
     return {file.name: kind.load(file) for file in PRETRAINED.glob(files)}
 
 
-# What a controller knows, and how it was searched or trained, in words for reports. In reports,
-# 1 M samples are a million samples.
+# Texts for reports: what a controller knows, and how the controller was searched or trained. In
+# reports, 1 M samples are a million samples.
 _KNOWS_STEP_TEST = "gain, time constant, delay"
 _KNOWS_DATA_SHEET = f"{_KNOWS_STEP_TEST}, dead zone, limits"
 _KNOWS_SIGN = "sign of the gain; settings searched on the paper's plant"
@@ -314,7 +300,8 @@ RENAMED = {
 def label(agent: str) -> str:
     """Return the name of a controller in tables and pictures, such as "MPC" for "mpc".
 
-    `agent` is the controller's name in options. A user's controller has only this name.
+    `agent` is the controller's name in options. In tables and pictures, a user's own controller
+    has the same name as in options.
     """
     return ROSTER[agent].label if agent in ROSTER else agent
 
@@ -322,9 +309,9 @@ def label(agent: str) -> str:
 def looks(agents: Sequence[str]) -> dict[str, tuple[str, str]]:
     """Return the colour and the marker, for matplotlib, of each controller by its name.
 
-    `agents` are the names of controllers in options. The controllers that are not in `ROSTER`,
-    which are a user's own, get the colours and markers of `OWN_LOOKS` in turn, in the order of
-    their names, so that the order of `agents` does not matter.
+    Users' own controllers, which are not in `ROSTER`, get the colours and markers of
+    `OWN_LOOKS` in alphabetical order of the names, so that the order of `agents` does not
+    matter.
     """
     own_names = sorted(agent for agent in agents if agent not in ROSTER)
     own_looks = dict(zip(own_names, itertools.cycle(OWN_LOOKS), strict=False))

@@ -1,8 +1,9 @@
 """Make the pictures of reports in one style.
 
-A picture is 975 pixels wide, and its text is still readable when a page shows the picture 750
-pixels wide. A picture has a white background with a margin, so that it is also readable on a
-dark page. The title of a picture is a sentence that says what the picture shows.
+A picture is 975 pixels wide, and has text that is still readable when a page shows the picture
+750 pixels wide. A picture has a white background with a margin, so that the picture is readable
+on a dark page, too. The title of a picture is a sentence that states the main result in the
+picture.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = "#0072B2", "#D55E00"  # of lines that do not belong to a controller
-WIDTH = 7.5  # of a picture, inches: 975 pixels at 130 dots per inch
-TITLE_CHARACTERS = 90  # per line of a title: as many as fit in the width of a picture
+COLOURS = "#0072B2", "#D55E00"  # colours of lines that do not belong to a controller
+WIDTH = 7.5  # width of a picture, inches: 975 pixels at 130 dots per inch
+TITLE_CHARACTERS = 90  # number of characters that fit in a line of a title
 PALETTE_SIZE = 128  # number of colours in a PNG file; fewer colours make the file smaller
 # matplotlib's `rcParams` for all pictures.
 STYLE: Any = {
@@ -53,8 +54,9 @@ AT_LEAST = "\N{GREATER-THAN OR EQUAL TO}"
 RATIO_LABEL = (
     "error ratio: mean error / least possible error\n(axis logarithmic in the ratio minus 1)"
 )
-# The smallest error ratio that is drawn; smaller ratios are drawn at this ratio. An error ratio
-# of 1 would lie at minus infinity on an axis that is logarithmic in the ratio minus 1.
+# The smallest error ratio on the axis; smaller error ratios are drawn at `RATIO_FLOOR`. An
+# error ratio of 1 would lie at minus infinity on an axis that is logarithmic in the error ratio
+# minus 1.
 RATIO_FLOOR = 1.001
 # Error ratios with a label on the axis of error ratios, about equally far apart.
 RATIO_TICKS = 1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0, 4.0, 11.0, 31.0
@@ -67,9 +69,10 @@ def percent(share: float) -> str:
 
 @contextmanager
 def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
-    """Yield an empty figure with a title, to be drawn on in the block of a `with` statement.
+    """Yield a figure with a title, for use in a `with` statement: `with open_picture(...)`.
 
-    The figure is saved as a PNG file when the block ends without an error.
+    The figure is saved as a PNG file when the block of the `with` statement ends without an
+    error.
 
     Parameters
     ----------
@@ -78,9 +81,10 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
     height : float
         Height of the picture, inches. The width is `WIDTH`.
     title : str
-        A sentence above the picture, broken into lines of at most `TITLE_CHARACTERS`.
+        A sentence above the picture, broken into lines of at most `TITLE_CHARACTERS`
+        characters.
     """
-    from matplotlib import rc_context  # imported here, as it is slow
+    from matplotlib import rc_context  # imported here, as the import is slow
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from PIL import Image
@@ -100,16 +104,17 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
 def excess(ratios: ArrayLike) -> NDArray[np.float64]:
     """Return error ratios minus 1, an array of the shape of `ratios`, for a logarithmic axis.
 
-    Ratios below `RATIO_FLOOR` are first replaced by `RATIO_FLOOR`, so all results are positive.
+    Error ratios below `RATIO_FLOOR` are replaced by `RATIO_FLOOR`, so that all results are
+    positive.
     """
     return np.maximum(ratios, RATIO_FLOOR) - 1.0
 
 
 def scale_by_ratio(axes: Axes, ratios: ArrayLike) -> None:
-    """Make the y axis of `excess(ratios)` logarithmic, with error ratios at its ticks.
+    """Make the y axis of `excess(ratios)` logarithmic, with error ratios at the ticks.
 
-    `ratios` are all error ratios in the panel, which set the ends of the axis. If a ratio is
-    below `RATIO_FLOOR`, the label of the lowest tick says "at most 1.001", with a sign.
+    The ends of the axis follow from `ratios`, which are all error ratios in the panel. If an
+    error ratio is below `RATIO_FLOOR`, the label of the lowest tick begins with `AT_MOST`.
     """
     from matplotlib.ticker import NullLocator
 

@@ -18,20 +18,20 @@ from benchmarks.lib.storage import write_text
 class Section:
     """A section of a report.
 
-    The texts of a section are plain text: characters such as `*` are shown as they are.
+    All texts of a section are plain text, in which characters such as `*` have no meaning.
 
     Attributes
     ----------
     title : str
-        The heading of the section; "" for a section without a heading.
+        Heading of the section; "" for a section without a heading.
     text : sequence of str
-        The paragraphs of the section, above the table.
+        Paragraphs of the section, above the table.
     table : pandas.DataFrame, optional
-        A table whose cells are texts.
+        Table whose cells are texts; None for a section without a table.
     bold : collection of str
-        Texts: a cell of the table that is equal to one of these texts is shown in bold type.
+        Texts that are shown in bold type in the cells of the table.
     pictures : mapping
-        The caption of each picture, by the name of its PNG file in the folder of the report.
+        Caption of each picture, by the name of the PNG file in the folder of the report.
     """
 
     title: str
@@ -53,18 +53,18 @@ def write_report(
     Parameters
     ----------
     folder
-        The folder to write to, which already has the PNG files of the sections. If the file of
-        a picture is missing, the report leaves the picture out.
+        Folder of the report, which already has the PNG files of the sections. If the file of a
+        picture is missing, the report leaves the picture out.
     title
-        The heading of the report, as plain text.
+        Heading of the report, as plain text.
     sections
-        The sections of the report, in order.
+        Sections of the report, in order.
     origin
-        The provenance of the results, as `provenance.origin` returns it. If some results are
-        missing, the key "missing" has a text that says which results are missing, and the
-        report begins with this text.
+        Provenance of the results, as `provenance.origin` returns it. If results are missing,
+        `origin["missing"]` is a text that says which results are missing, and the report begins
+        with this text.
     printed
-        The number of sections to print on the terminal; None prints all sections.
+        Number of sections to print on the terminal; None prints all sections.
     """
     unfinished = f"Unfinished: {origin['missing']}." if "missing" in origin else ""
     page = [f"# {escape(title)}"]
@@ -82,7 +82,7 @@ def write_report(
 def _in_markdown(section: Section, folder: Path) -> list[str]:
     """Return a section as blocks of Markdown, such as a heading, a paragraph or a table.
 
-    A picture whose PNG file is not in `folder` is left out.
+    A picture whose PNG file is not in `folder` is left out of the blocks.
     """
 
     def cell(text: object) -> str:
@@ -105,8 +105,8 @@ def _in_markdown(section: Section, folder: Path) -> list[str]:
 def escape(text: object) -> str:
     """Return one line of Markdown that a reader sees as the plain text `str(text)`.
 
-    Names of controllers, files and columns come from the user. Without this function, such a
-    name could end a cell of a table, or bring HTML and links into the page.
+    Users choose names of controllers, files and columns. Without `escape`, a name could end a
+    cell of a table, or bring HTML and links into the page.
     """
     escaped = " ".join(str(text).split()).replace("\\", "\\\\")
     escaped = escaped.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
@@ -118,10 +118,7 @@ def escape(text: object) -> str:
 
 
 def _source(origin: Mapping[str, Any]) -> str:
-    """Return the last line of a report: the time, the version of the code, and the command.
-
-    `origin` is the provenance of the results, as `provenance.origin` returns it.
-    """
+    """Return the last line of a report: start time, version of the code, and command."""
     version = f"code {origin['code'][:12]}"
     commit = origin["commit"]  # 40 digits, and "-dirty" if files have changed; "" without git
     if commit:
@@ -143,8 +140,8 @@ def _print(section: Section) -> None:
 def on_screen(table: pd.DataFrame) -> str:
     """Return a table as text whose lines are no wider than the terminal.
 
-    If the columns of the table need more than the width of the terminal, the text consists of
-    several tables, one below the other, each with the first column and some other columns.
+    A table that is too wide for the terminal is split into several tables, one below the other,
+    each with the first column and some of the remaining columns.
     """
     width = shutil.get_terminal_size((150, 24)).columns
     first = table.columns[0]

@@ -9,7 +9,7 @@ import scipy  # SciPy loads its modules on first use.
 from numpy.typing import ArrayLike, NDArray
 
 INTERVAL_ENDS = 0.025, 0.975  # the quantiles that are the ends of a 95 % interval
-RESAMPLES = 2000  # of a bootstrap: the noise of the resampling is small beside the interval
+RESAMPLES = 2000  # number of resamples of a bootstrap; with more, the interval hardly changes
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Estimate:
     value : float
         The estimate.
     low, high : float
-        The ends of the confidence interval, in the unit of `value`; infinite if unknown.
+        Ends of the confidence interval, in the unit of `value`; infinite if unknown.
     runs : int
-        The number of runs from which the value was estimated.
+        Number of runs from which the value was estimated.
     """
 
     value: float
@@ -32,15 +32,15 @@ class Estimate:
     runs: int
 
     def scaled(self, factor: float) -> "Estimate":
-        """Return the estimate with value and interval multiplied by `factor`, above 0."""
+        """Return the estimate with value and interval multiplied by a positive `factor`."""
         return Estimate(factor * self.value, factor * self.low, factor * self.high, self.runs)
 
     def __format__(self, form: str) -> str:
-        """Return the estimate as text, "value (low to high)", for use in f-strings.
+        """Return the estimate as text, "value (low to high)".
 
-        All three numbers have the format `form`, such as ".3f". If `low` and `high` are equal
-        as texts, the result is "value" alone. If `high` is infinite, the result is
-        "value (one run)".
+        The argument `form` is the format of each number, such as ".3f". If `low` and `high`
+        have equal texts, the text of the estimate is "value". If `high` is infinite, the text
+        of the estimate is "value (one run)".
         """
         value = as_text(self.value, form)
         low = as_text(self.low, form)
@@ -53,7 +53,7 @@ class Estimate:
 
 
 def as_text(value: float, form: str) -> str:
-    """Return a number as text in a format such as ".3f", with "0.000" in place of "-0.000"."""
+    """Return a number as text in the format `form`, with "0.000" in place of "-0.000"."""
     text = format(value, form)
     is_zero = set(text) <= set("-0.")
     return text.lstrip("-") if is_zero else text
@@ -62,8 +62,8 @@ def as_text(value: float, form: str) -> str:
 def student(values: ArrayLike) -> Estimate:
     """Return the mean over runs, with the confidence interval of Student's t distribution.
 
-    `values` has one value for each run, shape (runs,). For a single run, and if all values are
-    equal, the interval has zero width.
+    `values` has one value for each run, shape (runs,). If `values` has only one value, or equal
+    values, the interval has zero width.
     """
     numbers = np.asarray(values, dtype=np.float64)
     mean = float(numbers.mean())
@@ -80,8 +80,8 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     """Return a quantile over runs, with the confidence interval of `scipy.stats.quantile_test`.
 
     `values` has one value for each run, shape (runs,), and `probability` is from 0 to 1: 0.5
-    gives the median. The ends of the interval are two of the values, or infinite if there are
-    too few runs. The interval assumes nothing about the distribution of the values.
+    gives the median. Each end of the confidence interval is one of the values, or infinite if
+    `values` has too few values. The interval is valid for any distribution of the values.
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64))
     # An infinite value cannot be interpolated.
@@ -100,8 +100,8 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
 def share(happened: NDArray[np.bool_]) -> Estimate:
     """Return the share of runs in which an event happened, with Wilson's confidence interval.
 
-    `happened` says for each run whether the event happened, shape (runs,). The share is from 0
-    to 1.
+    The share is a number from 0 to 1. `happened` says for each run whether the event happened,
+    shape (runs,).
     """
     count = int(happened.sum())
     runs = len(happened)
@@ -110,27 +110,28 @@ def share(happened: NDArray[np.bool_]) -> Estimate:
 
 
 def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
-    """Return the mean over tasks, members and runs, with a percentile bootstrap's interval.
+    """Return the mean over tasks, members and runs, with an interval from a bootstrap.
 
-    Members are the networks of one controller that were trained with different seeds. All
-    members run with the same noise in run i, so members and runs are resampled independently,
-    and a resample consists of all pairs of a resampled member and a resampled run (A. B. Owen,
-    "The pigeonhole bootstrap", Annals of Applied Statistics 1, 2007, 386-411). Tasks are not
-    resampled. With five members whose means differ far more than the runs do, the 95 % interval
-    contains the true mean in 82 % of the cases only.
+    Members are the networks of one controller that were trained with different seeds. As all
+    members have the same noise in run i, members and runs are resampled independently: a
+    resample consists of all pairs of a resampled member and a resampled run (Owen 2007, "The
+    pigeonhole bootstrap", Annals of Applied Statistics 1, 386-411). Tasks are not resampled. If
+    the means of five members differ far more than the runs of a member, the 95 % interval
+    contains the true mean in only 82 % of the cases.
 
     Parameters
     ----------
     tasks
-        The values of each task, such as the errors in a scenario: arrays of one common shape,
-        (runs,) for a controller without members, or (members, runs).
+        An array of values for each task, such as the errors in a scenario. All arrays of
+        `tasks` have the same shape: (members, runs), or (runs,) for a controller without
+        members.
     seed
         Seed of the resampling.
     """
     tables = [np.atleast_2d(np.asarray(task, dtype=np.float64)) for task in tasks]
     all_values = np.concatenate([table.ravel() for table in tables])
     mean = float(all_values.mean())
-    if all(np.ptp(table) == 0.0 for table in tables):  # Nothing was random.
+    if all(np.ptp(table) == 0.0 for table in tables):  # No value was random.
         return Estimate(mean, mean, mean, all_values.size)
     generator = np.random.default_rng(seed)
     members, runs = tables[0].shape
@@ -144,16 +145,16 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
 
 
 def percentiles(values: NDArray[np.float64], method: Any = "linear") -> dict[str, Any]:
-    """Return the median and the 10th and 90th percentile over runs, as `median`, `p10`, `p90`.
+    """Return the percentiles `median`, `p10` (10th) and `p90` (90th) over runs.
 
     Parameters
     ----------
     values
-        The values, shape (..., runs). The results have the shape (...).
+        Array of shape (..., runs). Each returned percentile has the shape (...).
     method
-        The method of `numpy.percentile`. If some values are infinite, such as the settling time
-        of a run that never settles, the method "higher" is used in place of this one, since an
-        infinite value cannot be interpolated.
+        The argument `method` of `numpy.percentile`. If a value is infinite, such as the
+        settling time of a run that never settles, the method "higher" is used instead of
+        `method`, since an infinite value cannot be interpolated.
     """
     if not np.isfinite(values).all():
         method = "higher"

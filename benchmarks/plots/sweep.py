@@ -1,7 +1,8 @@
 """Draw the results of a sweep, which runs controllers on many plants.
 
-Plants that differ in delay and gain are drawn as a map, and other plants as a curve of the
-sorted error ratios. An error ratio is a mean error divided by the least possible mean error.
+If the plants differ only in delay and gain, the picture has maps over delay and gain.
+Otherwise, the picture has a curve of the sorted error ratios for each controller. An error
+ratio is a mean error divided by the least possible mean error.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from benchmarks.lib.pictures import (
 from mptc_gym import Parameters
 
 NEAR_RATIO = 1.05  # largest error ratio that counts as near the least possible error
-MARKED_SHARE = 0.5  # smallest share of the runs on a plant that fail for a mark in the map
+MARKED_SHARE = 0.5  # A plant has a mark in the map if at least this share of its runs fail.
 MOST_COLUMNS = 3  # number of maps in a row
 RATIO_CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
 COLOUR_MAP = "viridis_r"  # light for small error ratios, dark for large ones
@@ -49,15 +50,15 @@ NOMINAL_MARK: Any = {"color": "black", "marker": "+", "ms": 12, "mew": 1.8, "lin
 
 
 def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
-    """Draw the results of a sweep, as a map or as a curve of the sorted errors.
+    """Draw the error ratios of a sweep as maps, or as curves of the sorted error ratios.
 
-    A map is drawn if the plants differ in delay and gain only.
+    Maps are drawn if the plants differ only in delay and gain.
 
     Parameters
     ----------
     runs : pandas.DataFrame
-        A row for each run, as `benchmarks.sweep.table` returns it. The table has a column
-        "dead_zone" if the plants differ in more than delay and gain.
+        Table with a row for each run, as `benchmarks.sweep.table` returns it. The table has a
+        column "dead_zone" if the plants differ not only in delay and gain.
     path : Path
         The PNG file.
     nominal : Parameters
@@ -75,8 +76,8 @@ def plant_medians(runs: pd.DataFrame) -> pd.DataFrame:
 
     The columns are `agent` (the controller), `plant`, `delay` (samples), `gain_factor`, `ratio`
     (the median error ratio of the runs), `oscillates` (the share of the runs that oscillate)
-    and `useless` (the share of the runs whose error is no smaller than that of an idle valve).
-    `runs` is the argument of `draw`.
+    and `useless` (the share of the runs whose error is at least the error of an idle valve).
+    `runs` is a table with a row for each run, as `benchmarks.sweep.table` returns it.
     """
     groups = runs.groupby(["agent", "plant"], sort=False)
     plants = groups[["delay", "gain_factor"]].first()
@@ -90,8 +91,8 @@ def plant_medians(runs: pd.DataFrame) -> pd.DataFrame:
 def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
     """Draw a curve of the sorted error ratios of the plants for each controller.
 
-    `plants` is the table of `plant_medians`, and `path` is the PNG file. Plants without an
-    error ratio, whose least possible error is unknown, are left out.
+    Plants whose least possible error is unknown have no error ratio, and are left out of the
+    curves.
     """
     plants = plants.dropna(subset=["ratio"])
     styles = looks(list(plants["agent"].unique()))
@@ -115,7 +116,7 @@ def sorted_finding(plants: pd.DataFrame) -> str:
     """Return the title of the curves: a sentence on 90th percentiles of the error ratios.
 
     The sentence names the two controllers with the smallest 90th percentiles over the plants,
-    and the controller with the largest one. `plants` is the table of `plant_medians`.
+    and the controller with the largest 90th percentile.
     """
     ratios = plants.groupby("agent")["ratio"].quantile(0.9).sort_values()
     if ratios.empty:
@@ -131,14 +132,14 @@ def sorted_finding(plants: pd.DataFrame) -> str:
 def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
     """Draw maps of the error ratio over delay and gain, one map for each controller.
 
-    `plants` is the table of `plant_medians`, in the order of the maps. `path` is the PNG file.
-    Each map has a mark at the nominal plant.
+    `plants` is the table that `plant_medians` returns. Each map has a mark at the nominal
+    plant.
     """
     agents = list(plants["agent"].unique())
     columns = min(MOST_COLUMNS, len(agents))
     rows = math.ceil(len(agents) / columns)
     classes = BoundaryNorm(RATIO_CLASSES, ncolors=256, extend="max")
-    # If the nominal plant has ranges, its mark is in the middle.
+    # If delay or gain of the nominal plant has a range, the mark is at the middle of the range.
     nominal_delay = np.mean(nominal.range_of("delay"))
     nominal_gain = np.mean(nominal.range_of("gain_factor"))
     height = 1.5 + 1.9 * rows  # inches: title, legend and colour bar, and the rows
@@ -172,9 +173,8 @@ def draw_map(plants: pd.DataFrame, path: Path, nominal: Parameters) -> None:
 def map_finding(plants: pd.DataFrame) -> str:
     """Return the title of the maps: a sentence on plants with nearly the least possible error.
 
-    The sentence names the two controllers that have an error ratio of at most `NEAR_RATIO` on
-    the largest shares of the plants, and says what share all other controllers reach at most.
-    `plants` is the table of `plant_medians`.
+    The sentence compares the shares of the plants on which each controller has an error ratio
+    of at most `NEAR_RATIO`: the two largest shares, and an upper limit of all smaller shares.
     """
     bounded = plants.dropna(subset=["ratio"])  # plants with a least possible error
     is_near = bounded["ratio"] <= NEAR_RATIO
@@ -196,10 +196,10 @@ def map_finding(plants: pd.DataFrame) -> str:
 
 
 def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) -> None:
-    """Draw the map of one controller: a cell for each plant, and marks where control fails.
+    """Draw a cell of one controller's map for each plant, with marks where control fails.
 
-    `plants` are the rows of `plant_medians` with this controller, and `classes` maps an error
-    ratio to its class of colours.
+    `plants` are the controller's rows of the table that `plant_medians` returns, and `classes`
+    gives the class of colours of an error ratio.
     """
     cells = plants.pivot(index="gain_factor", columns="delay", values=["ratio", "useless"])
     ratios = cells["ratio"]
@@ -215,9 +215,9 @@ def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) ->
 
 
 def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
-    """Return the marks that occur in the maps, as artists for the legend, by their texts.
+    """Return the legend of the maps: matplotlib's artists by text.
 
-    `plants` is the table of `plant_medians` with all controllers.
+    The legend has only marks that occur in the maps.
     """
     entries: dict[str, Artist] = {"the nominal plant": Line2D([], [], **NOMINAL_MARK)}
     if (plants["oscillates"] >= MARKED_SHARE).any():
