@@ -82,9 +82,10 @@ def _spec_of_training(model: Any) -> EnvSpec:
     except Exception as error:  # whatever a wrapper of another package raises
         raise ValueError(
             "policy must be a model with its environments (mptc_gym.sb3.load returns one), "
-            "made by gymnasium.make or make_vec_env, in wrappers that can be imported and "
-            "record their arguments, as gymnasium.utils.RecordConstructorArgs does, got "
-            f"the spec {spec}: {error}"
+            "which must come from gymnasium.make or make_vec_env, in wrappers that can be "
+            "imported and record their arguments, as gymnasium.utils.RecordConstructorArgs "
+            "does, got "
+            f"{spec}: {error}"
         ) from error
     return cast("EnvSpec", spec)
 
@@ -115,8 +116,8 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     different_specs = set(map(str, plants.get_attr("spec")))
     if isinstance(plants, VecEnvWrapper) or len(different_specs) > 1:
         raise ValueError(
-            "policy must have equal environments, in no VecEnvWrapper, to be saved by "
-            f"mptc_gym.sb3.save, got {type(plants).__name__}: save the model by "
+            "policy must have environments that do not differ, in no VecEnvWrapper, to be "
+            f"saved here, got {type(plants).__name__}: save the model by "
             "model.save(path), and the statistics of a VecNormalize by "
             "model.get_vec_normalize_env().save(path)"
         )

@@ -175,8 +175,8 @@ class GymnasiumVecEnv(VecEnv):
     def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise a NotImplementedError: there are no single environments to call or change."""
         raise NotImplementedError(
-            "a GymnasiumVecEnv holds no single environments to call or change, only vector "
-            f"environments in its attribute `batches`, got {args or kwargs}"
+            "a GymnasiumVecEnv holds no single environments to call or change: use "
+            f"`batches`, the vector environments of the GymnasiumVecEnv, got {args or kwargs}"
         )
 
     set_attr = env_method
