@@ -1,4 +1,4 @@
-"""Write offline data sets of plants under controllers: `python -m benchmarks.datasets`."""
+"""Record offline data sets of controlled plants: `python -m benchmarks.datasets`."""
 
 import os
 import shutil
@@ -18,23 +18,24 @@ from benchmarks.lib.storage import out_folder
 from mptc_gym import PRESETS, evaluate
 from mptc_gym.scoring.rollout import rollout
 
-SAMPLES = 1200  # length of an episode
+SAMPLES = 1200  # number of samples in an episode
 EPISODES = 100  # default number of episodes in a data set
 SEED = SEEDS["data sets"].first  # seed of the first episode of each data set
 # Number of episodes on which learners are evaluated; no data set has one of these episodes.
 EVALUATION_EPISODES = 50
-# The controllers that collect the episodes of a data set, for each behaviour. Several
-# controllers take turns, episode by episode.
+# For each behaviour, the controllers that control the plant in a data set. Several controllers
+# take turns: each controls every n-th episode.
 BEHAVIOURS = {
     "pi": ("pi",),
     "smith": ("smith",),
     "mixed": ("pi", "pi-simc", "smith", "nn"),
 }
-# The version of each data set, which rises when the content changes. Since version 1, the Smith
-# predictor has another anti-windup, and the Smith predictor and the PI controller `pi-simc` are
-# tuned to an Ms (largest magnitude of the sensitivity function) of 1.6.
+# Version of the data sets of each behaviour, which rises when the content changes. Since
+# version 1, the Smith predictor has another anti-windup, and the Smith predictor and the PI
+# controller `pi-simc` are tuned to an Ms (largest magnitude of the sensitivity function) of
+# 1.6.
 VERSIONS = {"pi": 0, "smith": 1, "mixed": 1}
-# The preset and the behaviour of each data set.
+# Preset and behaviour of each data set, by the data set's id.
 IDS = {
     f"middlepoint/{preset}/{behaviour}-v{VERSIONS[behaviour]}": (preset, behaviour)
     for preset in ("paper", "disturbed", "fouling")
@@ -46,7 +47,7 @@ DEFAULT_FOLDER = "~/.minari/datasets"  # Minari's folder if the environment vari
 
 @dataclass(frozen=True)
 class Episode:
-    """A logged episode of N samples of a plant under a controller."""
+    """A recorded episode of N samples, in which a controller controls a plant."""
 
     controller: str  # name of the controller
     seed: int  # seed of the environment's reset
@@ -58,10 +59,7 @@ class Episode:
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Write offline data sets to Minari's folder.
-
-    A data set includes the least possible error of its plant.
-    """
+    """Write offline data sets to Minari's folder, with each plant's least possible error."""
 
     ids: Annotated[Names, Parameter(choices=IDS)] = field(default=(), kw_only=False)
     """Data sets to write (default: all)."""
@@ -70,7 +68,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Write data sets, print the mean errors of each data set, and return a last message."""
+    """Write data sets, print each data set's mean errors, and return the final message."""
     folder = Path(os.environ.get(FOLDER_VARIABLE) or DEFAULT_FOLDER)
     root = out_folder(folder.expanduser().absolute(), FOLDER_VARIABLE)
     for dataset_id in dict.fromkeys(options.ids or IDS):  # without repeated ids
@@ -79,22 +77,22 @@ def work(options: Options) -> str:
 
 
 def arguments_of(preset: str) -> dict[str, Any]:
-    """Return the arguments of the environment from which data sets of a preset are logged."""
+    """Return the environment's arguments for the data sets of a preset."""
     return {
         **PRESETS[preset],
         "setpoint": "random",
         "reward": "absolute",  # with `error_scale`, the reward is -|e|, degC
         "error_scale": 1.0,
-        # More past actions than the delay: the observation then determines the next output,
-        # apart from noise and changes of the set point.
+        # The observation holds more past actions than the delay in samples, and so determines
+        # the next output apart from noise.
         "action_window": 20,
     }
 
 
 def record(preset: str, behaviour: str, episodes: int = EPISODES) -> list[Episode]:
-    """Return logged episodes of a preset under the controllers of a behaviour.
+    """Return recorded episodes of a preset, controlled by `BEHAVIOURS[behaviour]` in turn.
 
-    Episode i has the seed `SEED + i`.
+    Episode i of the list that `record` returns has the seed `SEED + i`.
     """
     controllers = BEHAVIOURS[behaviour][:episodes]
     recorded: list[Episode] = []
@@ -105,23 +103,18 @@ def record(preset: str, behaviour: str, episodes: int = EPISODES) -> list[Episod
 
 
 def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> list[Episode]:
-    """Return a logged episode of a preset under a controller for each seed.
-
-    The plants of all seeds are stepped together.
-    """
+    """Return a recorded episode of a preset's plant under a controller for each seed."""
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.loop.rollout import make_plants
 
     arguments = arguments_of(preset)
     controller: Any = ROSTER[controller_name].in_service(arguments, len(seeds), SEED)
     controller.reset()
-    actions: list[NDArray[np.float32]] = []  # of each sample, shape (episodes, 1)
+    actions: list[NDArray[np.float32]] = []  # actions of each sample, shape (episodes, 1)
 
     def act(observations: Any) -> NDArray[np.float32]:
-        """Return the controller's actions, clipped to [-1, 1], and log them.
-
-        The actuator saturates beyond +-1, so the clipping does not change the plant's output.
-        """
+        """Return the controller's actions, clipped to [-1, 1], and record the actions."""
+        # Clipping does not change the plant's output, as the actuator saturates at -1 and 1.
         actions.append(np.clip(controller.act(observations), -1.0, 1.0).astype(np.float32))
         return actions[-1]
 
@@ -131,7 +124,7 @@ def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> l
     errors = np.array([sample.infos["error"] for sample in samples[1:]])
     rewards = -np.abs(errors)
     actions_of_all = np.stack(actions)
-    # The arrays have an axis of samples, an axis of episodes, and perhaps more.
+    # The first axis of each array is the sample, and the second axis is the episode.
     return [
         Episode(controller_name, seed, observations[:, i], actions_of_all[:, i], rewards[:, i])
         for i, seed in enumerate(seeds)
@@ -139,38 +132,37 @@ def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> l
 
 
 def write(root: Path, dataset_id: str, episodes: int) -> str:
-    """Collect a data set, write it to Minari's folder, and return its mean errors as text.
+    """Record a data set in Minari's folder `root`, and return the mean errors as text.
 
-    The data set replaces an older data set of this id in Minari's folder `root`. If the files
-    cannot be written, an `UnfinishedError` is raised, and no incomplete data set remains.
+    A data set with the same id in the folder `root` is replaced. If the files cannot be
+    written, an `UnfinishedError` is raised, and no incomplete data set remains.
     """
     destination = root / dataset_id
     logged = record(*IDS[dataset_id], episodes)
     try:
         # Minari does not list the contents of hidden folders.
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as folder:
-            # HDF5 crashes if the disk is full. A file as large as the data set is written and
-            # removed first: on a full disk, this raises an OSError.
+            # HDF5 crashes if the disk is full. To raise an OSError instead, a file as large as
+            # the data set is written first and then removed.
             room = Path(folder, "room")
             room.write_bytes(bytes(1_000_000 + episodes * 250_000))
             room.unlink()
-            os.environ[FOLDER_VARIABLE] = folder  # Minari takes no folder as an argument
+            os.environ[FOLDER_VARIABLE] = folder  # Minari has no argument for the folder
             mean_errors = _create(dataset_id, logged)
             shutil.rmtree(destination, ignore_errors=True)
             destination.parent.mkdir(parents=True, exist_ok=True)
             Path(folder, dataset_id).replace(destination)
     except OSError as error:
-        raise UnfinishedError(f"{destination} could not be written: {error}") from error
+        raise UnfinishedError(
+            f"the data set {destination} could not be written: {error}"
+        ) from error
     finally:
         os.environ[FOLDER_VARIABLE] = str(root)
     return mean_errors
 
 
 def _create(dataset_id: str, episodes: list[Episode]) -> str:
-    """Write logged episodes as a data set to Minari's folder; return mean errors as text.
-
-    The environment variable `FOLDER_VARIABLE` names the folder.
-    """
+    """Write recorded episodes as a data set of Minari, and return mean errors as text."""
     import minari
     from minari.data_collector import EpisodeBuffer
 

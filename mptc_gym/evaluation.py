@@ -1,4 +1,4 @@
-"""Score any policy on fixed episodes, in the environments in which the policy is to act."""
+"""Score a policy on episodes with fixed seeds, relative to the least possible error."""
 
 from __future__ import annotations
 
@@ -24,56 +24,59 @@ from mptc_gym.vector_env import MiddlePointVectorEnv
 
 Values = NDArray[np.float64]  # one number for each episode, shape (episodes,)
 
-# Seed of the first episode of a published score; the next episode has the next seed. The value
-# is arbitrary, but never changes, so that scores stay comparable.
+# Seed of the first episode of a published score; episode i has `SEED + i`. The seed is
+# arbitrary, but never changes, so that published scores remain comparable.
 SEED: Final = 7_000_000
 EPISODES: Final = 100  # episodes of a published score
-# Seed of the first episode for choosing among policies. No published score uses the episodes
-# from this seed on.
+# Seed of the first validation episode. Validation episodes serve to choose among policies, and
+# no published score uses a validation episode.
 VALIDATION_SEED: Final = 5_000_000
-VALIDATION_EPISODES: Final = 200  # episodes from `VALIDATION_SEED` on that have bounds
+VALIDATION_EPISODES: Final = 200  # validation episodes with a known least possible error
 SAMPLES: Final = 1200  # samples of an episode, unless the environment ends the episode earlier
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
-# The arguments of an environment that change observations or rewards, but not the least
-# possible error of a controller.
+# Arguments of an environment that change observations or rewards, but not the least error that
+# a controller can have.
 _WITHOUT_EFFECT_ON_BOUNDS: Final = *WINDOWS, "reward", "error_scale", "move_weight"
-_RESAMPLES: Final = 2000  # how often episodes are resampled for the bootstrap interval
+_RESAMPLES: Final = 2000  # number of bootstrap samples for the interval of a score
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
-    """The result of `evaluate`: errors, scores and valve travel of a policy.
+    """Result of `evaluate`: the errors, the scores and the valve travel of a policy.
 
-    `str` of an evaluation is a summary in one line.
+    `str(evaluation)` returns a summary in one line.
 
     Attributes
     ----------
     env : str
-        The id of the environment, or the name of the class of an environment without an id.
+        Id of the environment, or the class name of an environment that has no id.
     mean_error, travel : float
-        Mean of `errors`, degC, and mean of `travels`, t/h.
+        Mean of the attribute `errors`, degC, and mean of the attribute `travels`, t/h.
     errors : ndarray, shape (episodes,)
-        Mean error of each episode, degC: the mean of |e(k)| over the samples k = 1 to N, where
-        e is the error of the temperature.
+        Mean absolute error of each episode, degC: the mean of |e(k)| over the samples k = 1 to
+        N, where e(k) is the deviation of the temperature from the set point.
     travels : ndarray, shape (episodes,)
-        Valve travel of each episode, t/h: the sum of the magnitudes of all changes of the
-        applied flow.
+        Valve travel of each episode, t/h: the sum of the absolute changes of the flow that the
+        valve applies.
     seeds : range
         Seeds of the episodes.
     note : str
-        Why there is no score, or why the valve never moved, and what to do; otherwise "".
+        Reason why the score is missing or why the valve never moved, with advice; otherwise "".
     least_possible : float or None
-        Least possible mean error of any controller, degC. This attribute and all that follow
-        are None if the package has no bound for the episodes; `note` says why.
+        Least mean error that any controller can have on the episodes, degC. If the package does
+        not know the least possible error, `least_possible` and all following attributes are
+        None, and `note` says why.
     multiple : float or None
         `mean_error / least_possible`.
     score : float or None
-        0 for the mean error of a valve that never moves, 1 for the least possible mean error.
+        Score of the policy: 0 for the mean error of a valve that never moves, 1 for the least
+        possible mean error.
     interval : (float, float) or None
-        95 % bootstrap interval of the score, from resampled episodes.
+        95 % confidence interval of the score, from a bootstrap that resamples episodes.
     least, scores : ndarray or None, shape (episodes,)
-        Least possible mean error of each episode, degC, and score of each episode. If only
-        noise and load are random, `least` is the expected value over noise and load.
+        Least possible mean error of each episode, degC, and score of each episode. If nothing
+        but noise and load is random in the environment, `least` holds the same expected value
+        for all episodes.
     """
 
     env: str
@@ -115,50 +118,55 @@ def evaluate(
     seed: int = SEED,
     **arguments: Any,
 ) -> Evaluation:
-    """Run a policy on fixed episodes and return errors, score and valve travel.
+    """Run a policy on episodes with fixed seeds, and return errors, score and valve travel.
 
-    The policy acts in a copy of exactly the environments that are passed as `env`. Windows of
-    the observation, wrappers, and the statistics of wrappers that normalise must be those of
-    the policy's training. The environments themselves do not change, so a training may score
-    its model in the environments of the training.
+    The environments must have the observation windows (numbers of past values in an
+    observation), the wrappers and the normalisation statistics of the policy's training. The
+    policy acts in copies of the environments that are passed as `env`. A model can be scored in
+    the model's own training environments during the training.
 
     Parameters
     ----------
     policy
-        A policy has one of four forms:
+        Policy to score, in one of four forms:
 
-        - an object with `predict`, such as a model of Stable-Baselines3; the keywords `state`,
-          `episode_start` and `deterministic=True` are passed to `predict` if `predict` takes
-          them;
-        - an object with `act`, such as a controller in `agents`; `act` takes observations,
-          shape (n, size), and returns actions, shape (n, 1), in NumPy arrays;
-        - a `torch.nn.Module`, or a method of a module; the module receives the observations in
-          a tensor of the type of its weights, is in evaluation mode, and computes no gradients;
-        - any other function of observations, shape (n, size), that returns actions, shape
-          (n, 1), in NumPy arrays.
+        - An object with a method `predict`, such as a model of Stable-Baselines3. `predict`
+          receives those of the keywords `state`, `episode_start` and `deterministic=True` that
+          `predict` takes.
 
-        A bound method `predict` or `act` stands for the object of the method. If the policy has
-        a method `reset`, this method is called before each round of episodes. What a policy
-        learns in an evaluation stays with the policy.
+        - An object with a method `act`, such as a controller in `agents`. `act` takes
+          observations, shape (n, size), and returns actions, shape (n, 1), in NumPy arrays.
+
+        - A `torch.nn.Module`, or a method of a module. A module receives observations as a
+          tensor of the type of the module's weights, in evaluation mode and without gradients.
+
+        - Any other function that takes observations, shape (n, size), and returns actions,
+          shape (n, 1), in NumPy arrays.
+
+        A bound method `model.predict` or `controller.act` is treated as the object `model` or
+        `controller`. If the policy has a method `reset`, `evaluate` calls `reset` whenever all
+        environments begin a new episode. `evaluate` does not copy the policy, so a policy that
+        learns while acting keeps what is learnt.
     env
-        An id, such as one of `IDS`, or an `EnvSpec`; a function that makes one environment in
-        each call; or environments: a single environment, a vector environment of Gymnasium, or
-        a `VecEnv` of Stable-Baselines3, such as `model.get_env()`. If there are fewer
-        environments than `episodes`, the environments run several rounds of episodes.
+        Environment in one of three forms: an id, such as "MiddlePoint-v0", or an `EnvSpec`; a
+        function that returns a new environment; or an existing environment, vector environment
+        of Gymnasium or `VecEnv` of Stable-Baselines3, such as `model.get_env()`. If `env` holds
+        fewer environments than `episodes`, each environment runs several episodes in turn.
 
-        Environments that cannot be copied, such as those in other processes or with a window,
-        are used themselves, and begin a new episode after the evaluation. A copy shares with
-        its original the global random number generators, files that are opened by name, and
-        the variables outside a function that the function uses.
+        Environments that cannot be copied, because they run in other processes or show a
+        window, are used directly, and are reset after the evaluation. A copied environment and
+        the original environment share files that are opened by name, global random number
+        generators, and the global and closure variables of functions.
     episodes
         Number of episodes, at least 2. An episode has 1,200 samples, or fewer if the
         environment ends the episode earlier.
     seed
-        Seed of the first episode; the next episode has the next seed. The default is the seed
-        of all published scores. To choose among policies, use `VALIDATION_SEED` of
-        `mptc_gym.evaluation`: no published score uses the 200 episodes from this seed on.
+        Seed of the first episode; episode i has the seed `seed + i`. The default seed is the
+        seed of all published scores. To choose among policies, pass `VALIDATION_SEED` of
+        `mptc_gym.evaluation`: no published score uses the 200 seeds from `VALIDATION_SEED` on.
     **arguments
-        Further arguments for an id or a spec, as in `gymnasium.make`.
+        Further arguments of the environment, as in `gymnasium.make`, if `env` is an id or a
+        spec.
 
     Returns
     -------
@@ -168,11 +176,11 @@ def evaluate(
     Raises
     ------
     ValueError
-        If `env` does not exist, is not of this package, or runs other episodes than those of
-        the seeds; if the policy or the policy's actions do not fit `env`; if the policy is a
-        model of Stable-Baselines3 that still has the environments of its training, and `env`
-        has other windows or wrappers; or if the policy trains in environments that cannot be
-        copied.
+        If `env` does not exist, is no environment of this package, or runs episodes of other
+        seeds. If the policy does not fit `env`, or returns actions of the wrong shape. If the
+        policy is a model of Stable-Baselines3 with training environments, and `env` has other
+        observation windows or wrappers. If `env` is the training environment of the policy and
+        cannot be copied.
 
     Examples
     --------
@@ -181,8 +189,8 @@ def evaluate(
     MiddlePoint-v0: mean error 6.613 degC, 7.26 times the least possible; score -0.394; \
 valve travel 10 t/h; 100 episodes, all alike
 
-    A model of Stable-Baselines3 acts in its own environments, or in other environments with the
-    same windows and wrappers:
+    A model of Stable-Baselines3 can be scored in its training environments, or in other
+    environments with the same observation windows and wrappers:
 
     >>> from mptc_gym.sb3 import make_vec_env, spec_of
     >>> from stable_baselines3 import PPO
@@ -200,7 +208,10 @@ valve travel 10 t/h; 100 episodes, all alike
         parameters = groups[0].parameters
         case = case_of(parameters)
         if any(case_of(group.parameters) != case for group in groups):
-            raise ValueError("env must have the same plants, but for windows and rewards")
+            raise ValueError(
+                "env must have the same plants in all environments; only observation windows "
+                "and rewards may differ"
+            )
         runs = _run(policy, plants, seeds, parameters)
     bound = find_bound(case, runs.length, seeds)
     notes = [bound.why_not, _why_idle(runs.travels, parameters)]
@@ -219,7 +230,7 @@ valve travel 10 t/h; 100 episodes, all alike
 
 
 class _Runs(NamedTuple):
-    """Errors and valve travels of episodes that have the same length."""
+    """Mean errors and valve travels of episodes of equal length."""
 
     errors: Values  # mean of |e(k)| of each episode, degC, with e the error of the temperature
     travels: Values  # sum of the changes of the applied flow in each episode, t/h
@@ -227,11 +238,7 @@ class _Runs(NamedTuple):
 
 
 def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _Runs:
-    """Run an episode of a policy for each seed, in rounds of as many episodes as plants.
-
-    A ValueError is raised if episodes have different lengths, or if their noise, load or set
-    points are not those of the seeds.
-    """
+    """Return the mean errors and valve travels of a policy in one episode for each seed."""
     n = plants.num_envs
     rounds: list[_Runs] = []
     for first in seeds[::n]:
@@ -242,18 +249,15 @@ def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _
         rounds.append(_measure(samples, n))
         if rounds[-1].length != rounds[0].length:
             _refuse_lengths(rounds[-1].length)
-    # The last round may have more episodes than are asked for.
+    # The plants run at the same time, so there may be more episodes than seeds.
     errors = np.hstack([runs.errors for runs in rounds])[: len(seeds)]
     travels = np.hstack([runs.travels for runs in rounds])[: len(seeds)]
     return _Runs(errors, travels, rounds[0].length)
 
 
 def _measure(samples: Iterator[Sample], n: int) -> _Runs:
-    """Return errors and valve travels of n plants from the samples of one episode.
-
-    A ValueError is raised if not all plants end the episode at the same sample.
-    """
-    next(samples)  # sample k = 0, which no policy has affected
+    """Return the mean errors and valve travels of n plants from the samples of one episode."""
+    next(samples)  # skip sample k = 0, which the policy cannot affect
     total_errors = np.zeros(n)
     travels = np.zeros(n)
     applied = np.zeros(n)  # applied flow, t/h, which is 0 at rest
@@ -271,15 +275,14 @@ def _measure(samples: Iterator[Sample], n: int) -> _Runs:
 
 
 def _refuse_lengths(length: int) -> NoReturn:
-    """Raise a ValueError: episodes differ in length, and one of them has `length` samples."""
-    raise ValueError(f"env must end all episodes at once, got an end after {length} samples")
+    """Raise a ValueError: one episode has ended after `length` samples, others have not."""
+    raise ValueError(
+        f"env must end all episodes at once, got an episode of {length} samples among others"
+    )
 
 
 def _why_idle(travels: Values, parameters: Parameters) -> str:
-    """Return why the valve has never moved, and what helps; "" if the valve has moved.
-
-    `travels` are the valve travels of the episodes, t/h.
-    """
+    """Return why the valve never moved, with advice, or "" if the valve moved."""
     if travels.any():
         return ""
     low, high = parameters.range_of("dead_zone")
@@ -293,17 +296,14 @@ def _why_idle(travels: Values, parameters: Parameters) -> str:
 
 
 class Bound(NamedTuple):
-    """The least possible mean error of each episode, or why the package has no bound."""
+    """The least possible mean error of each episode, or the reason why it is unknown."""
 
     least: Values | None  # least possible mean error of each episode, degC, shape (episodes,)
     why_not: str = ""  # why `least` is None
 
 
 def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
-    """Return the least possible mean error of each episode, or why the package has none.
-
-    `length` is the number of samples of an episode, and each episode has one of the seeds.
-    """
+    """Return the least possible mean errors for the seeds, or why they are unknown."""
     least_by_seed = _read_bounds().get(case_of(parameters))
     if least_by_seed is None:
         return Bound(
@@ -333,14 +333,11 @@ def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
 
 @cache
 def _read_bounds() -> dict[Parameters, dict[int, Values]]:
-    """Return all bounds of the package, which `python -m benchmarks.bounds --package` wrote.
+    """Return the least possible mean errors in the file `bounds.json`, degC.
 
-    Returns
-    -------
-    dict of dict of ndarray
-        Least possible mean errors, degC. The outer key is the case of the plants, as `case_of`
-        returns it. The inner key is the seed of the first episode: element i of the array
-        belongs to this seed + i. An array of one element belongs to all seeds.
+    The keys of the outer dict are plant arguments, in the form that `case_of` returns. Each
+    inner dict maps the seed of a first episode to an array of the least possible mean errors
+    for successive seeds. An array with a single element is valid for all seeds.
     """
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
     bounds = {}
@@ -353,16 +350,16 @@ def _read_bounds() -> dict[Parameters, dict[int, Values]]:
 
 
 def case_of(parameters: Parameters) -> Parameters:
-    """Return arguments of plants, with defaults in place of those that change no bound.
+    """Return plant arguments, with defaults for observation windows and rewards.
 
-    Plants of the same case have the same least possible errors.
+    Plants for which `case_of` returns equal arguments have the same least possible error.
     """
     defaults = {name: ARGUMENTS[name].default for name in _WITHOUT_EFFECT_ON_BOUNDS}
     return replace(parameters, **defaults)
 
 
 def _idle_errors(parameters: Parameters, seeds: range) -> Values:
-    """Return the mean error of the episode of each seed if the valve never moves, degC."""
+    """Return the mean error in the episode of each seed, degC, if the valve never moves."""
     n = len(seeds)
     plants = MiddlePointVectorEnv(n, **asdict(parameters))
     idle_action = action_from_command(0.0, parameters.u_min, parameters.u_max)
@@ -372,18 +369,14 @@ def _idle_errors(parameters: Parameters, seeds: range) -> Values:
 
 
 def _with_scores(evaluation: Evaluation, least: Values, idle_errors: Values) -> Evaluation:
-    """Return an evaluation with the fields that need a bound, such as the score.
-
-    For each episode, `least` is the least possible mean error, and `idle_errors` is the mean
-    error if the valve never moves, both in degC.
-    """
+    """Return a copy of an evaluation with the fields that need the least possible errors."""
     gained = idle_errors - evaluation.errors
     possible = idle_errors - least
     n = len(gained)
     generator = np.random.default_rng(0)
     resampled_scores = []
     for _ in range(_RESAMPLES):
-        resample = generator.integers(n, size=n)  # numbers of episodes, drawn with replacement
+        resample = generator.integers(n, size=n)  # indices of episodes, drawn with replacement
         resampled_scores.append(gained[resample].mean() / possible[resample].mean())
     low, high = np.quantile(resampled_scores, (0.025, 0.975)).tolist()
     return replace(

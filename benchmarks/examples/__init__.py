@@ -1,1 +1,1 @@
-"""Hold example scripts that train policies, each of which can be copied and changed."""
+"""Hold example scripts that train policies, to copy and change."""

@@ -1,12 +1,13 @@
-"""Train a recurrent policy through the plants of `hard`: a start for an entry of your own.
+"""Train a recurrent policy by gradients through the plants of `MiddlePointHard-v0`.
 
     python -m benchmarks.examples.recurrent             # three minutes, writes recurrent.pt
     python -m benchmarks.compare --presets --scenarios hard --agents mpc \
         --agent mine=benchmarks.examples.recurrent:make
 
-`hard` is the preset of `MiddlePointHard-v0`, with plants that differ between episodes. The
-policy observes set point and error only, so a gated recurrent unit has to identify the plant.
-The last layer of the network changes the flow, and past flows are among the network's inputs.
+The plants of `MiddlePointHard-v0` (preset `hard`) differ between episodes. The policy observes
+only the set point and the error, so the network's gated recurrent unit (GRU) has to identify
+the plant from past samples. The network's output is a change of the flow, and past flows are
+among the network's inputs.
 """
 
 import sys
@@ -22,24 +23,20 @@ from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 FILE = Path("recurrent.pt")  # the file of the trained network
-SAMPLES = 1200  # length of an episode
-# Samples that gradients reach back. A flow first shows in the output after up to 25 samples, so
-# a segment contains most of a flow's effect.
+SAMPLES = 1200  # number of samples in an episode
+# Number of samples in a segment, over which gradients are computed. The delay is at most 25
+# samples, so a segment contains most of the effect of a flow on the output.
 SEGMENT = 150
-TEMPERATURE = 5.0  # temperatures are divided by this, degC, to be of order 1
-LARGEST_MOVE = 0.4  # largest change of the action per sample; half the actuator's range is 1
-# Number of past actions among the inputs: enough for all flows that have not yet shown in the
-# output, for the longest delay.
+TEMPERATURE = 5.0  # scale of temperatures, degC, for network inputs of order 1
+LARGEST_MOVE = 0.4  # largest change of the action per sample; actions are in [-1, 1]
+# Number of past actions among the network's inputs. With the longest delay, these are all flows
+# that have not yet affected the output.
 MEMORY = 26
 NODES = 64  # nodes of the recurrent unit
 
 
 class Recurrent(nn.Module):
-    """A recurrent policy for n control loops, which remembers its state and its past actions.
-
-    With the methods `reset` and `act`, the network is a policy for `mptc_gym.evaluate` and for
-    the command `benchmarks.compare`.
-    """
+    """A recurrent policy network for n plants, with a state and past actions of each plant."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,22 +46,22 @@ class Recurrent(nn.Module):
         self.reset()
 
     def begin(self, n: int) -> None:
-        """Set the state and the past actions to 0, for n plants at rest."""
+        """Set the recurrent state and the past actions of n plants to 0."""
         self.state = torch.zeros(n, NODES)
         self.actions = torch.zeros(n, MEMORY)  # newest first
         self.has_begun = True
 
     def reset(self) -> None:
-        """Forget the episode: the next call of `act` begins a new episode."""
+        """Let the next call of `act` begin a new episode."""
         self.has_begun = False
 
     def detach(self) -> None:
-        """Cut the PyTorch graph, so that later gradients do not reach earlier samples."""
+        """Cut the PyTorch graph, so that gradients do not flow back to earlier samples."""
         self.state = self.state.detach()
         self.actions = self.actions.detach()
 
     def forward(self, setpoint: Tensor, error: Tensor) -> Tensor:
-        """Return the actions of a sample, shape (n, 1), and update the state.
+        """Return the actions at one sample, shape (n, 1), and update the recurrent state.
 
         `setpoint` and `error` are the set points and the measured errors, degC, shape (n,).
         """
@@ -77,10 +74,10 @@ class Recurrent(nn.Module):
         return action
 
     def act(self, observations: Any) -> np.ndarray[Any, Any]:
-        """Return the actions of a sample, shape (n, 1).
+        """Return the actions for observations of n plants at one sample, shape (n, 1).
 
-        `observations` is an array of shape (n, size): equal numbers of latest set points and
-        latest errors, degC, newest first.
+        Each row of `observations`, shape (n, size), holds the latest set points and an equal
+        number of latest errors, degC, each newest first.
         """
         signals = torch.as_tensor(np.asarray(observations), dtype=torch.float32)
         n, size = signals.shape
@@ -93,16 +90,10 @@ class Recurrent(nn.Module):
 
 
 def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
-    """Train a network by truncated backpropagation through the plants, and return it.
+    """Return a policy network, trained by truncated backpropagation through the plants.
 
-    Parameters
-    ----------
-    steps
-        Number of steps of the optimiser, each from a segment of `SEGMENT` samples.
-    plants
-        Number of plants that are simulated together.
-    seed
-        Seed of the initial weights.
+    `steps` is the number of optimiser steps, each with gradients over `SEGMENT` samples of
+    `plants` plants, and `seed` is the seed of the network's initial weights.
     """
     torch.manual_seed(seed)
     network = Recurrent()
@@ -114,7 +105,7 @@ def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
         if step % (SAMPLES // SEGMENT) == 0:
             observations, _ = env.reset(seed=step)
             network.begin(plants)
-        # For the gradient, all that happened before this segment is constant.
+        # Gradients do not flow back beyond the first sample of this segment.
         env.detach()
         network.detach()
         observations = observations.detach()
@@ -122,7 +113,7 @@ def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
         for _ in range(SEGMENT):
             actions = network(observations[:, 0], observations[:, 1])
             observations, _, _, _, infos = env.step(actions)
-            errors.append(infos["error"])  # without the noise of the observed error
+            errors.append(infos["error"])  # the error without measurement noise
         loss = nn.functional.huber_loss(
             torch.stack(errors), torch.zeros(SEGMENT, plants), delta=0.1
         )
@@ -135,10 +126,10 @@ def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
 
 
 def make() -> Recurrent:
-    """Return the policy that is saved in `FILE`.
+    """Return the trained policy from the file `recurrent.pt`.
 
-    The command `benchmarks.compare` calls this function for its option
-    `--agent mine=benchmarks.examples.recurrent:make`.
+    The command `benchmarks.compare` calls `make` for the option `--agent
+    mine=benchmarks.examples.recurrent:make`.
     """
     network = Recurrent()
     network.load_state_dict(torch.load(FILE, weights_only=True))

@@ -1,22 +1,26 @@
 """Train PPO of Stable-Baselines3 to control the plant, in a quarter of a minute on one core.
 
 `python benchmarks/examples/sb3.py` trains a policy, saves the policy in `ppo-0.zip`, and prints
-its scores. The score of an idle valve is 0, and the score of the least possible error is 1.
+the policy's scores. A score is 0 for a valve that never moves, and 1 for the least possible
+error.
 
-This file can be copied without any other file; `benchmarks/train/ppo.py` imports it. The
-training works for the following reasons:
+Four choices make the training fast:
 
 - **Groups.** Eight plants have the same noise and set points, and differ only in the random
-  part of their actions. From the advantage of each plant, the mean over its group is
-  subtracted, which makes the variance of the advantages much smaller.
-- **Changes as inputs.** The policy's inputs are the error, and changes of set point,
-  temperature and flow, but not the values of set point, temperature and flow. The policy has no
-  biases. So the policy keeps the flow constant only if the error is 0: there is no steady
-  error. And the policy behaves in the same way at temperatures of -5 degC and +5 degC.
-- **Less and less exploration.** The standard deviation of the actions falls by a schedule. A
-  standard deviation that is learnt stays too high.
-- **Changes of the flow as actions.** The action changes the flow (wrapper `IncrementalAction`,
-  which also compensates the dead zone).
+  part of their actions. From the advantage of each plant, the mean advantage of the plant's
+  group is subtracted, which makes the variance of the advantages much smaller.
+
+- **Changes as inputs.** The policy's inputs are the error, and the changes of set point,
+  temperature and flow, but not the values of set point, temperature and flow. The policy
+  network has no biases, so the policy keeps the flow constant only if the error is 0: there is
+  no steady-state error. A policy without the temperature as an input behaves in the same way at
+  temperatures of -5 degC and +5 degC.
+
+- **Less and less exploration.** The standard deviation of the actions falls by a schedule,
+  because a standard deviation that PPO learns remains too high.
+
+- **Changes of the flow as actions.** The wrapper `IncrementalAction` makes the action a change
+  of the flow, and compensates the dead zone of the valve.
 """
 
 import argparse
@@ -42,8 +46,8 @@ SETTINGS: dict[str, Any] = {
     "batch_size": 4096,
     "n_epochs": 5,
     "gamma": 0.96,  # discount factor per sample
-    # With a lambda below 1, an advantage would partly rest on the value function for rewards
-    # that an action affects only after the delay.
+    # With a lambda below 1, advantages would depend on how well the value function predicts the
+    # rewards after the delay.
     "gae_lambda": 1.0,
 }
 # Arguments of the environment that determine the observation.
@@ -60,21 +64,12 @@ PLANTS: dict[str, Any] = {
 
 
 def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
-    """Return the inputs of the networks: the error, and changes of the three other signals.
+    """Return the networks' inputs: the error, and changes of set point, output and action.
 
-    Parameters
-    ----------
-    observations
-        Observations of the environment, shape (n, size): latest set points, errors, outputs and
-        actions, in this order, each newest first.
-    windows
-        The numbers of set points, errors (one), outputs and actions in an observation, in this
-        order.
-
-    Returns
-    -------
-    Tensor
-        Inputs of order 1, with a row for each observation, shape (n, inputs).
+    The inputs are of order 1, with a row for each row of `observations`. A row of
+    `observations` holds the latest set points, errors, outputs and actions, each newest first.
+    `windows` holds the numbers of set points, errors (one), outputs and actions in a row of
+    `observations`.
     """
     setpoints, errors, outputs, actions = observations.split([*windows.values()], dim=1)
     scaled_changes = [
@@ -86,22 +81,12 @@ def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
 
 
 def changes(window: Tensor, short_stretches: int) -> Tensor:
-    """Return the changes of a signal between successive stretches of its past.
+    """Return changes of a signal between stretches of samples, shape (n, stretches - 1).
 
-    A change is the mean over a stretch minus the mean over the next older stretch.
-
-    Parameters
-    ----------
-    window
-        Past samples of a signal for n plants, newest first, shape (n, length).
-    short_stretches
-        Number of newest stretches that are one sample long. The older stretches have 2, 4, 8
-        samples and so on, and the oldest stretch has the remaining samples.
-
-    Returns
-    -------
-    Tensor
-        The changes, newest first, shape (n, stretches - 1).
+    `window` holds past samples of the signal for n plants, newest first, shape (n, length). A
+    change is the mean over a stretch of samples minus the mean over the next older stretch. The
+    newest `short_stretches` stretches have one sample each, older stretches have 2, 4, 8 and so
+    on, and the oldest stretch has the remaining samples.
     """
     lengths = [1] * short_stretches
     while remaining := window.shape[1] - sum(lengths):
@@ -111,27 +96,24 @@ def changes(window: Tensor, short_stretches: int) -> Tensor:
 
 
 class Changes(BaseFeaturesExtractor):
-    """The inputs of policy and value function, computed by `inputs`, as a feature extractor."""
+    """A feature extractor that computes the inputs of policy network and value network."""
 
     def __init__(self, observation_space: Any) -> None:
-        # An error, and 2, 12 and 34 changes of set point, output and action.
+        # The 49 inputs are 1 error, and 2, 12 and 34 changes of set point, output and action.
         super().__init__(observation_space, features_dim=49)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Return the inputs, shape (n, 49), for observations of shape (n, size)."""
+        """Return the network inputs, shape (n, 49), for observations of shape (n, size)."""
         return inputs(observations, WINDOWS)
 
 
 class GroupBuffer(RolloutBuffer):
-    """A rollout buffer whose advantages are relative to the mean over a group of plants.
-
-    `GROUP` successive plants, which have the same noise and set points, form a group.
-    """
+    """A rollout buffer that subtracts from each advantage the mean of a group of plants."""
 
     def compute_returns_and_advantage(self, last_values: Tensor, dones: Any) -> None:
-        """Compute returns and advantages, and subtract the group's mean from each advantage."""
+        """Compute returns and advantages, and subtract the mean advantage of each group."""
         super().compute_returns_and_advantage(last_values, dones)
-        # A view: the subtraction changes `self.advantages`, shape (samples, plants).
+        # `groups` is a view of `self.advantages`, shape (samples, plants), and changes it.
         groups = self.advantages.reshape(self.buffer_size, -1, GROUP)
         groups -= groups.mean(axis=2, keepdims=True)
 
@@ -145,7 +127,7 @@ class Exploration(BaseCallback):
     Parameters
     ----------
     first, last
-        The natural logarithm at the start and at the end of the training.
+        Natural logarithm of the standard deviation at the start and at the end of the training.
     """
 
     def __init__(self, first: float, last: float) -> None:
@@ -163,22 +145,16 @@ class Exploration(BaseCallback):
 
 
 def make_ppo(plants: VecEnv, seed: int, **policy_arguments: Any) -> PPO:
-    """Return an untrained model of PPO whose policy has no biases.
+    """Return an untrained model of PPO whose policy network has no biases.
 
-    Parameters
-    ----------
-    plants
-        The training plants, in groups of `GROUP`.
-    seed
-        Seed of the initial weights, the exploration and the plants.
-    **policy_arguments
-        Arguments of the policy's class, `policy_kwargs` of Stable-Baselines3.
+    `plants` are the training plants, in groups of `GROUP` plants with the same seed. The
+    `policy_arguments` are items of the argument `policy_kwargs` of the class `PPO`.
     """
     model = PPO(
         "MlpPolicy",
         plants,
         # The learning rate falls with the share of the training that remains. At the last
-        # update nothing remains; the lower bound lets this update have an effect.
+        # update, this share is 0, and the lower bound keeps the learning rate above 0.
         learning_rate=lambda remaining: 2e-3 * max(remaining, 0.05),
         rollout_buffer_class=GroupBuffer,
         policy_kwargs=policy_arguments,
@@ -194,10 +170,10 @@ def make_ppo(plants: VecEnv, seed: int, **policy_arguments: Any) -> PPO:
 
 
 def main() -> None:
-    """Train a policy, save it and print its scores."""
+    """Train a policy by PPO, save the policy, and print the policy's scores."""
     parser = argparse.ArgumentParser(description="PPO of Stable-Baselines3 on 512 plants.")
     parser.add_argument("--steps", type=int, default=1_000_000, help="samples of experience")
-    parser.add_argument("--seed", type=int, default=0, help="of policy, exploration and plants")
+    parser.add_argument("--seed", type=int, default=0, help="seed of policy and plants")
     parser.add_argument("--out", type=Path, default=Path(), help="folder of the policy")
     options = parser.parse_args()
 

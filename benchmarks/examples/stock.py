@@ -1,10 +1,11 @@
-"""Learn to control `MiddlePointHard-v0` from reward alone, with algorithms of stock libraries.
+"""Train policies for `MiddlePointHard-v0` by PPO, recurrent PPO, SAC and TD3.
 
     python -m benchmarks.examples.stock ppo --seed 0 --minutes 4 --out curves.csv
 
-An algorithm has its default settings, except those in `TRAININGS`. The policy is scored four
-times during its training, and each score becomes a row of the CSV file.
-`benchmarks/published/stock_curves.csv` has five seeds of each algorithm.
+Each algorithm of Stable-Baselines3 or sb3-contrib has the default settings, except for the
+settings in `TRAININGS`. Each policy is scored four times during the training, and each score
+becomes a row of a CSV file. The file `benchmarks/published/stock_curves.csv` holds the scores
+of five seeds of each algorithm.
 """
 
 import argparse
@@ -30,11 +31,11 @@ WINDOWS: Final = {"setpoint_window": 1, "error_window": 8, "action_window": 31}
 
 
 class Training(NamedTuple):
-    """How an algorithm trains a policy."""
+    """Settings for the training of a policy by one algorithm."""
 
     algorithm: Any  # class of the algorithm
     policy: str  # name of the policy's class
-    plants: int  # number of plants that are simulated together
+    plants: int  # number of plants that are simulated at the same time
     settings: dict[str, Any]  # arguments of the algorithm's class that are not defaults
 
 
@@ -49,19 +50,19 @@ TRAININGS: Final = {
 
 
 class Curve(BaseCallback):
-    """Write the learning curve of a training to a CSV file, and then stop the training.
+    """A callback that writes a learning curve to a CSV file, and then stops the training.
 
-    The curve has `SCORES` points, at equal intervals of the training's processor time. The time
-    that the scores take does not count.
+    The learning curve has `SCORES` points, at equal intervals of the training's processor time,
+    which does not include the time for the scores.
 
     Parameters
     ----------
     seconds
-        Processor time of the training, s.
+        Processor time after which the training stops, s.
     labels
-        Values for the first columns of each row, by column.
+        Values of the first columns in each CSV row, by column name.
     path
-        The CSV file, to which rows are appended.
+        Path of the CSV file, to which rows are appended.
     """
 
     def __init__(self, seconds: float, labels: dict[str, Any], path: Path) -> None:
@@ -73,7 +74,7 @@ class Curve(BaseCallback):
         self._scoring_seconds = 0.0  # processor time of all scores so far
 
     def _on_step(self) -> bool:
-        """Score the policy if a score is due; return whether another score is to come."""
+        """Score the policy if a score is due; return False after the last score."""
         training_seconds = time.process_time() - self._start - self._scoring_seconds
         if training_seconds >= self._due_times[0]:
             del self._due_times[0]
@@ -83,7 +84,7 @@ class Curve(BaseCallback):
         return bool(self._due_times)
 
     def _append_score(self, training_seconds: float) -> None:
-        """Score the policy on validation episodes, and append a row to the CSV file."""
+        """Score the policy on validation episodes, and append the score to the CSV file."""
         spec = spec_of(self.model, IDS["hard"])
         result = evaluate(self.model, spec, episodes=EPISODES, seed=VALIDATION_SEED)
         assert result.score is not None  # the package has bounds of validation episodes
@@ -105,7 +106,7 @@ class Curve(BaseCallback):
 
 
 def main() -> None:
-    """Train a policy as the command line says, and write its learning curve."""
+    """Train a policy with the options of the command line, and write the learning curve."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("algorithm", choices=TRAININGS)
     parser.add_argument("--seed", type=int, default=0)

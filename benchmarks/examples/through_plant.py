@@ -1,9 +1,10 @@
-"""Train your own network through the plant: `python -m benchmarks.examples.through_plant`.
+"""Train a network by gradients through the plant, as an example to copy and change.
 
-The PyTorch environment is differentiable, so the error of a whole run has a gradient with
-respect to the policy's weights. Training needs no value function and no exploration, and takes
-half a minute on one core. The policy is then tested on the paper's square wave, on which it was
-not trained.
+The command is `python -m benchmarks.examples.through_plant`. The PyTorch environment is
+differentiable, so the error of a whole run has a gradient with respect to the policy's weights.
+Training by gradients needs no value function and no exploration, and takes half a minute on one
+core. The trained policy is tested on the paper's square wave of set points, which was not used
+in the training.
 """
 
 import sys
@@ -30,15 +31,16 @@ STEADY_ACTION = -0.1465
 def act(network: nn.Module, observations: Tensor) -> Tensor:
     """Return the actions of the policy for n plants, shape (n, 1).
 
-    An action is the steady action for the set point plus the network's output. All inputs of
-    the network are 0 if the plant has been in steady state at the set point for 24 samples.
+    An action is the network's output plus the constant action that keeps the temperature at the
+    set point in steady state. All inputs of the network are 0 if the plant has been in steady
+    state at the set point for 24 samples.
 
     Parameters
     ----------
     network
-        The network, from 48 inputs to one output.
+        Policy network with 48 inputs and one output.
     observations
-        The set point, 24 outputs and 24 actions of each plant, shape (n, 49).
+        Observations: the set point, 24 outputs and 24 actions of each plant, shape (n, 49).
     """
     setpoint, outputs, actions = observations.split([1, 24, 24], dim=1)
     steady_action = STEADY_ACTION * setpoint
@@ -48,19 +50,7 @@ def act(network: nn.Module, observations: Tensor) -> Tensor:
 
 
 def run(network: nn.Module, plants: MiddlePointTorchEnv, samples: int, seed: int) -> Tensor:
-    """Run the policy on n plants, and return the errors, degC, shape (samples, n).
-
-    Parameters
-    ----------
-    network
-        The network of the policy.
-    plants
-        The environment of n plants.
-    samples
-        Length of the run.
-    seed
-        Seed of the environment's reset, which determines the set points.
-    """
+    """Return the temperature errors of the policy on n plants, degC, shape (samples, n)."""
     observations, _ = plants.reset(seed=seed)
     errors = []
     for _ in range(samples):
@@ -72,14 +62,8 @@ def run(network: nn.Module, plants: MiddlePointTorchEnv, samples: int, seed: int
 def main(steps: int = 100, plants: int = 64, samples: int = 300) -> Evaluation:
     """Train a policy, and return its evaluation on the paper's square wave of set points.
 
-    Parameters
-    ----------
-    steps
-        Number of updates of the network's weights, each from one run.
-    plants
-        Number of plants in a run.
-    samples
-        Length of a run.
+    `steps` is the number of weight updates, each of which uses one run of `plants` plants for
+    `samples` samples.
     """
     torch.manual_seed(0)
     layers = nn.Linear(48, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 1)

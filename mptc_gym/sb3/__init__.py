@@ -1,4 +1,4 @@
-"""Train with Stable-Baselines3 on a batch of plants, and save models with their spec.
+"""Train, score, save and load models of Stable-Baselines3 with many plants at once.
 
     plants = make_vec_env("MiddlePoint-v0", 64, seed=0, wrapper={"compensate_dead_zone": True},
                           action_window=20, setpoint="random")

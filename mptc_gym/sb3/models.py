@@ -1,4 +1,4 @@
-"""Save and load models of Stable-Baselines3 with their environments, and score trainings."""
+"""Save, load and score models of Stable-Baselines3 together with their environments."""
 
 from __future__ import annotations
 
@@ -32,32 +32,33 @@ SPEC_FILE = "mptc_gym.json"  # name of the file that `save` adds to the zip of a
 
 
 def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any) -> EnvSpec:
-    """Return the spec of an environment with the windows and wrappers of a model's training.
+    """Return an `EnvSpec` with the observation windows and wrappers of a model's training.
 
-    The spec is for `evaluate`, as in::
+    Pass the returned spec to `evaluate`, for example::
 
         evaluate(model, spec_of(model, "MiddlePointHard-v0"))
 
     Parameters
     ----------
     policy
-        A model of Stable-Baselines3 with the environments of its training.
+        Model of Stable-Baselines3 that has its training environments (`model.get_env()`).
     env
-        An id or an `EnvSpec`.
+        Id or `EnvSpec` of the environment.
     **arguments
-        Further arguments for the environment, as in `gymnasium.make`.
+        Further arguments of the environment, as in `gymnasium.make`.
 
     Returns
     -------
     EnvSpec
-        The spec of `env` with the window sizes and the wrappers of Gymnasium of the model's
-        environments. A spec holds no wrappers of Stable-Baselines3, such as `VecNormalize`.
+        Spec of `env` with the observation windows and the Gymnasium wrappers of the model's
+        training environments. A spec cannot hold wrappers of Stable-Baselines3, such as
+        `VecNormalize`.
 
     Raises
     ------
     ValueError
-        If the model has no environments, or if these environments cannot be made from their
-        spec.
+        If the model has no environments, or if `gymnasium.make` cannot make the model's
+        environments from their spec.
     """
     wrappers = _spec_of_training(policy).additional_wrappers
     window_sizes = plant_groups(policy.get_env())[0].parameters.windows
@@ -67,49 +68,47 @@ def spec_of(policy: Any, env: str | EnvSpec = "MiddlePoint-v0", **arguments: Any
 
 
 def _spec_of_training(model: Any) -> EnvSpec:
-    """Return the spec of the first environment of a model, without the `Monitor` around it.
-
-    A ValueError is raised if the model has no environments, or if `gymnasium.make` cannot make
-    the environment from the spec.
-    """
+    """Return the spec of a model's first training environment, without a `Monitor` wrapper."""
     spec: Any = None
     try:
         spec = model.get_env().get_attr("spec")[0]
-        # Gymnasium cannot make the Monitor that each model adds, and a Monitor changes nothing.
+        # Stable-Baselines3 adds a Monitor, which records only. Gymnasium cannot make a Monitor.
         wrappers = [
             wrapper for wrapper in spec.additional_wrappers if wrapper.name != "Monitor"
         ]
         spec = dataclasses.replace(spec, additional_wrappers=tuple(wrappers))
-        gymnasium.make(EnvSpec.from_json(spec.to_json()))  # a trial, also of the text form
+        # This call raises an error if the spec, in the form of JSON text, does not serve.
+        gymnasium.make(EnvSpec.from_json(spec.to_json()))
     except Exception as error:  # whatever a wrapper of another package raises
         raise ValueError(
-            "policy must be a model with its environments (see mptc_gym.sb3.load), which must "
-            "come from gymnasium.make or make_vec_env, in wrappers that can be imported and "
-            "record their arguments, as gymnasium.utils.RecordConstructorArgs does, got "
+            "policy must be a model with its environments (mptc_gym.sb3.load returns one), "
+            "which must come from gymnasium.make or make_vec_env, in wrappers that can be "
+            "imported and record their arguments, as gymnasium.utils.RecordConstructorArgs "
+            "does, got "
             f"{spec}: {error}"
         ) from error
     return cast("EnvSpec", spec)
 
 
 def save(model: BaseAlgorithm, path: str | Path) -> None:
-    """Save a model with the spec of its environments, in a zip that `load` reads.
+    """Save a model and the spec of the model's environments in a zip that `load` reads.
 
-    The zip is that of the method `model.save`, with one more file inside. An existing file at
-    `path` is replaced only when the new zip is complete.
+    `model.save` writes the zip, and `mptc_gym.sb3.save` adds a file with the spec. An existing
+    file at `path` is replaced only after the new zip is complete.
 
     Parameters
     ----------
     model
-        A model of Stable-Baselines3 with its environments.
+        Model of Stable-Baselines3 that has its training environments.
     path
-        Where to write the zip; `.zip` is added to a name without an ending.
+        Path of the new zip; `.zip` is added to a name without an ending.
 
     Raises
     ------
     ValueError
-        If the environments differ from each other, cannot be made from their spec, or are in a
-        `VecEnvWrapper`, such as `VecNormalize`, which is not part of a spec; or if the file
-        cannot be written.
+        If the model's environments differ from each other or cannot be made from their spec. If
+        the model's environments are in a `VecEnvWrapper`, such as `VecNormalize`, which a spec
+        cannot hold. If the zip cannot be written.
     """
     path = _zip_path(path)
     spec = _spec_of_training(model)
@@ -118,13 +117,14 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     if isinstance(plants, VecEnvWrapper) or len(different_specs) > 1:
         raise ValueError(
             "policy must have environments that do not differ, in no VecEnvWrapper, to be "
-            f"saved here, got {type(plants).__name__}: save it by model.save(path), and "
-            "statistics by model.get_vec_normalize_env().save(path)"
+            f"saved here, got {type(plants).__name__}: save the model by "
+            "model.save(path), and the statistics of a VecNormalize by "
+            "model.get_vec_normalize_env().save(path)"
         )
     algorithm = f"{type(model).__module__}:{type(model).__name__}"
     record = json.dumps({"algorithm": algorithm, "spec": spec.to_json()})
     try:
-        # The folder is new, so no other program writes to the file while it is incomplete.
+        # In a new folder, no other program touches the zip while the zip is incomplete.
         with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
             complete = Path(folder, "model.zip")
             model.save(complete)
@@ -136,7 +136,7 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
 
 
 def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
-    """Load a model that `save` wrote, with as many environments as in its training.
+    """Load a model from a zip of `save`, with as many new environments as in the training.
 
     Loading runs code from the zip and from the modules that the zip names: load only files that
     you trust.
@@ -144,19 +144,19 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     Parameters
     ----------
     path
-        The zip; `.zip` is added to a name without an ending.
+        Path of the zip; `.zip` is added to a name without an ending.
     **arguments
-        Further arguments of the method `load` of the algorithm's class, such as `device="cpu"`.
+        Further arguments of the `load` method of the model's class, such as `device="cpu"`.
 
     Returns
     -------
     BaseAlgorithm
-        The model, of the class that was saved, with new environments.
+        The saved model, an object of the same class as before, with new environments.
 
     Raises
     ------
     ValueError
-        If the file is missing, was not written by `save`, or cannot be loaded.
+        If the file at `path` is missing, was not written by `save`, or cannot be loaded.
     """
     path = _zip_path(path)
     if not path.is_file():
@@ -167,7 +167,7 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
             n_envs = json.loads(archive.read("data"))["n_envs"]
         algorithm = pkgutil.resolve_name(record["algorithm"])
         spec = EnvSpec.from_json(record["spec"])
-        # Only plants in no wrapper other than IncrementalAction can be stepped together.
+        # `make_batch` returns None for plants in wrappers other than IncrementalAction.
         if make_batch(gymnasium.make(spec), 1) is None:
             plants: VecEnv = DummyVecEnv([partial(gymnasium.make, spec)] * n_envs)
         else:
@@ -176,56 +176,56 @@ def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
     except Exception as error:  # whatever a damaged file or the code in it raises
         raise ValueError(
             f"{path} cannot be loaded as a zip of mptc_gym.sb3.save "
-            f"({type(error).__name__}: {error}); load other zips by their algorithm, and name "
-            "the environments where they act: evaluate(model, env)"
+            f"({type(error).__name__}: {error}); load other zips by the class of the model, as "
+            "in PPO.load(path), and pass environments to evaluate(model, env)"
         ) from error
 
 
 def _zip_path(path: str | Path) -> Path:
-    """Return a path with the ending `.zip`, or the path itself if it has an ending.
-
-    Stable-Baselines3 completes the paths of models by the same rule.
-    """
+    """Return a path, with `.zip` added if the path has no ending, as Stable-Baselines3 does."""
     path = Path(path)
     return path if path.suffix else path.with_suffix(".zip")
 
 
 class ScoreCallback(BaseCallback):
-    """Score the policy during a training, without exploration, and keep the best policy.
+    """Score a policy at intervals during the policy's training, and save the best policy.
 
-    The scored episodes have seeds from `VALIDATION_SEED` of `mptc_gym.evaluation` on, which no
-    published score uses. In `MiddlePoint-v0`, nothing is random, so the seeds do not matter:
-    choose a set point of your own for the scores, such as `setpoint_period=500`. The logger of
-    the model records `score/mean_error`, degC, and, where the package has a bound of the mean
-    error, `score/score`.
+    The policy is scored without exploration. The seeds of the scored episodes begin at
+    `VALIDATION_SEED` of `mptc_gym.evaluation`, and no published score uses these seeds.
+    `MiddlePoint-v0` has the same episode for all seeds, so choose a set point of your own for
+    scores in `MiddlePoint-v0`, such as `setpoint_period=500`. The model's logger records the
+    mean absolute error, degC, as `score/mean_error`. If the least possible error is known, the
+    logger records the score as `score/score`.
 
     Parameters
     ----------
     env
-        The environments in which the policy is scored, as in `mptc_gym.evaluate`; the training
-        environments are allowed. Environments of an id or a spec get the windows and wrappers
-        of the training, as by `spec_of`. Environments in a `VecNormalize` get the statistics
-        that the training has at the time of a score.
+        Environments in which the policy is scored, in any form that `mptc_gym.evaluate` takes;
+        the training environments are allowed. If `env` is an id or a spec, the environments get
+        the observation windows and the wrappers of the training. If `env` is in a
+        `VecNormalize`, each score uses the training's present normalisation statistics.
     every
-        Samples of experience between two scores, summed over all plants. The last score is at
-        the end of the training.
+        Number of training samples between two scores, summed over all plants. The policy is
+        scored once more at the end of the training.
     episodes
-        Number of episodes of a score. Where the least possible error differs from episode to
-        episode, the package has bounds for 200 episodes at most.
+        Number of episodes in each score. If plants or set points are random, scores exist only
+        for at most 200 episodes.
     path
-        Zip in which to keep the policy with the least mean error: see `save`. None keeps no
-        file. A ValueError is raised if the file exists before the first training.
+        Path of the zip in which `save` keeps the policy with the least mean error; None to
+        write no file. A ValueError is raised if the file at `path` exists before the first
+        training.
     verbose
-        1 prints each score, 0 does not.
+        1 to print each score, 0 to print nothing.
     **arguments
-        Further arguments for an id or a spec, as in `gymnasium.make`.
+        Further arguments of the environment, as in `gymnasium.make`, if `env` is an id or a
+        spec.
 
     Attributes
     ----------
     scores : list of (int, Evaluation)
-        For each score, the samples of experience at that time, and the result.
+        For each score, the number of training samples so far and the result of `evaluate`.
     best : Evaluation or None
-        The result with the least mean error; None before the first score.
+        Result of `evaluate` with the least mean error so far; None before the first score.
     """
 
     def __init__(
@@ -249,12 +249,12 @@ class ScoreCallback(BaseCallback):
         self._has_saved = False
 
     def _init_callback(self) -> None:
-        """Raise, before a training, the errors that would come up at the first score.
+        """Check the path and the environments before a training begins.
 
-        Stable-Baselines3 calls this method at the start of each `learn`. A ValueError is raised
-        if `path` exists or cannot be written, or if the environments do not fit the model.
+        A ValueError is raised if the file at `path` exists or cannot be written, or if the
+        environments for the scores do not fit the model.
         """
-        # Samples of experience at the latest score, or at the start of the training.
+        # Number of training samples at the latest score, or at the start of the training.
         self._samples_at_score = self.model.num_timesteps
         if self.path is not None:
             if self.path.exists() and not self._has_saved:
@@ -268,17 +268,17 @@ class ScoreCallback(BaseCallback):
             check_fit(self.model, plants)
 
     def _environment(self) -> tuple[Any, dict[str, Any]]:
-        """Return the argument `env` of `evaluate` for a score, and further arguments.
+        """Return an environment, and arguments of the environment, to pass to `evaluate`.
 
-        If `env` is in a `VecNormalize`, a copy is returned, which has the statistics that the
-        training has at present.
+        If `env` is in a `VecNormalize`, the returned environment is a copy of `env` with the
+        training's present normalisation statistics.
         """
         if isinstance(self._env, str | EnvSpec):
             return spec_of(self.model, self._env, **self._arguments), {}
         if not is_environment(self._env):
             return self._env, self._arguments
         env = Copy(self._env).env
-        # Further wrappers of either environment stay as they are.
+        # If one environment has more VecNormalize wrappers, `zip` leaves the last ones out.
         pairs = zip(_normalisers(env), _normalisers(self.training_env), strict=False)
         for of_copy, of_training in pairs:
             of_copy.ret_rms = copy.deepcopy(of_training.ret_rms)
@@ -287,18 +287,18 @@ class ScoreCallback(BaseCallback):
         return env, self._arguments
 
     def _on_step(self) -> bool:
-        """Score the policy if `every` samples have passed; return True to go on training."""
+        """Score the policy if a score is due; return True to continue the training."""
         if self.num_timesteps >= self._samples_at_score + self.every:
             self._score()
         return True
 
     def _on_training_end(self) -> None:
-        """Score the policy once more, unless there is a score of the present policy."""
+        """Score the policy that the training ends with, unless it has already been scored."""
         if self.num_timesteps > self._samples_at_score:
             self._score()
 
     def _score(self) -> None:
-        """Score the present policy, record and print the result, and keep the best policy."""
+        """Score the policy, record and print the result, and save the policy if it is best."""
         self._samples_at_score = self.num_timesteps
         env, arguments = self._environment()
         result = evaluate(
@@ -315,11 +315,11 @@ class ScoreCallback(BaseCallback):
                 save(self.model, self.path)
                 self._has_saved = True
         if self.verbose:
-            total = self.locals["total_timesteps"]  # of the training
+            total = self.locals["total_timesteps"]  # samples in the whole training
             mark = "; best" if is_best else ""
             print(f"{self.num_timesteps:,} of {total:,} samples: {result}{mark}", flush=True)
 
 
 def _normalisers(env: Any) -> list[VecNormalize]:
-    """Return each `VecNormalize` among the layers of an environment, outermost first."""
+    """Return the `VecNormalize` wrappers of a wrapped environment, outermost first."""
     return [layer for layer in layers(env) if isinstance(layer, VecNormalize)]

@@ -1,7 +1,4 @@
-"""Step batches of plants as one `VecEnv` of Stable-Baselines3; see `mptc_gym.sb3`.
-
-A batch is a vector environment of Gymnasium.
-"""
+"""Run vector environments of Gymnasium (batches) as one `VecEnv` of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -21,26 +18,27 @@ from mptc_gym.wrappers import IncrementalAction
 
 
 class GymnasiumVecEnv(VecEnv):
-    """Step whole batches at once, where `DummyVecEnv` steps one environment after another.
+    """A `VecEnv` of Stable-Baselines3 that steps vector environments of Gymnasium (batches).
 
-    All methods return bit for bit what a `DummyVecEnv` returns with the same environments, each
-    in a `Monitor`, except for infos: `step` returns an empty info for an environment whose
-    episode goes on, as a dict for each environment would take longer than the step.
+    All environments of a batch are stepped at once, whereas a `DummyVecEnv` steps one
+    environment after another. All methods return bit for bit what a `DummyVecEnv` returns for
+    the same environments in `Monitor` wrappers, except for the infos of `step`. To save time,
+    `step` returns an empty info for each environment whose episode has not ended.
 
     Parameters
     ----------
     *batches
-        Vector environments of Gymnasium with autoreset mode "SameStep" and with the same
-        spaces. Environments are numbered through all batches, in the order of the batches.
+        Vector environments of Gymnasium with autoreset mode "SameStep" and with equal spaces.
+        The index of an environment counts the environments of all batches, in the given order.
     spec
-        The spec of one environment with its wrappers, if all environments are alike.
+        Spec of a single environment with wrappers; None if the environments differ.
     group
-        Number of neighbouring environments that share a seed, and thus all random numbers.
+        Number of successive environments that share a seed, and thus all random numbers.
 
     Attributes
     ----------
     infos : dict
-        The infos of the latest `reset` or `step` by name, in arrays of shape (num_envs,).
+        Infos of the latest `reset` or `step`: a dict from names to arrays of shape (num_envs,).
     """
 
     def __init__(
@@ -53,7 +51,7 @@ class GymnasiumVecEnv(VecEnv):
         self.spec = spec
         self.group = group
         self.infos: dict[str, Any] = {}
-        self._slices: list[slice] = []  # for each batch, the numbers of its environments
+        self._slices: list[slice] = []  # indices of the environments of each batch
         num_envs = 0
         for batch in batches:
             self._slices.append(slice(num_envs, num_envs + batch.num_envs))
@@ -68,9 +66,9 @@ class GymnasiumVecEnv(VecEnv):
         )
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set and return the seeds of the next reset: environment i has `seed + i // group`.
+        """Set and return the seeds of the next reset: environment i gets `seed + i // group`.
 
-        None stands for a random seed.
+        If `seed` is None, the first seed is random.
         """
         first = cast("int", super().seed(seed)[0])  # which replaces None by a random seed
         seeds = [first + index // self.group for index in range(self.num_envs)]
@@ -78,14 +76,14 @@ class GymnasiumVecEnv(VecEnv):
         return seeds
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
-        """Set the seeds of the next reset: one integer for each environment."""
+        """Set the seeds of the next reset, one integer for each environment."""
         self._next_seeds = [*seeds]
 
     def reset(self) -> NDArray[Any]:
         """Reset all environments, and return the observations, shape (num_envs, size).
 
-        If neither `seed` nor `set_seeds` has set seeds since the latest reset, the sequences of
-        random numbers continue.
+        If no seeds have been set since the latest reset, the random number generators continue
+        without a new seed.
         """
         observations = []
         batch_infos = []
@@ -102,24 +100,24 @@ class GymnasiumVecEnv(VecEnv):
         return np.concatenate(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions for `step_wait`, shape (num_envs, 1)."""
+        """Store actions of shape (num_envs, 1) for the next call of `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all environments with the actions that `step_async` has stored.
+        """Step all environments with the actions from the latest call of `step_async`.
 
         Returns
         -------
         observations : ndarray
-            The observations, shape (num_envs, size); where an episode has ended, the first
-            observation of the next episode.
+            Observations, shape (num_envs, size). If the episode of an environment has ended,
+            the environment's observation is the first one of the next episode.
         rewards : ndarray of float32
-            The rewards, shape (num_envs,).
+            Rewards, shape (num_envs,).
         ended : ndarray of bool
-            Whether an episode has ended, shape (num_envs,).
+            Whether the episode of each environment has ended, shape (num_envs,).
         infos : list of dict
-            The info of each environment whose episode has ended, with the last observation as
-            "terminal_observation"; an empty dict for each other environment.
+            Info of each environment. If the episode of an environment has ended, the info holds
+            the last observation as "terminal_observation"; otherwise the info is empty.
         """
         returned = [
             batch.step(self._actions[numbers])
@@ -151,7 +149,7 @@ class GymnasiumVecEnv(VecEnv):
         return observations, rewards.astype(np.float32), ended, infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
-        """Return a picture of each environment; [] if the batches do not render."""
+        """Return a picture of each environment, or [] if the environments do not render."""
         images: list[NDArray[np.uint8]] = []
         for batch in self.batches:
             images += batch.render() or ()
@@ -165,8 +163,8 @@ class GymnasiumVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return the value of an attribute for each environment in `indices`.
 
-        The attribute "spec" is the spec of one environment. Any other attribute is that of the
-        environment's batch. `indices` is an index, several indices, or None for all.
+        The attribute "spec" is the spec of a single environment; any other attribute is taken
+        from the vector environment that holds the environment.
         """
         values: list[Any] = []
         for batch in self.batches:
@@ -175,10 +173,10 @@ class GymnasiumVecEnv(VecEnv):
         return [values[index] for index in self._get_indices(indices)]
 
     def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
-        """Raise a NotImplementedError: no environment of a batch has methods of its own."""
+        """Raise a NotImplementedError: there are no single environments to call or change."""
         raise NotImplementedError(
-            "use `batches`, as an environment of a batch has no methods of its own, got "
-            f"{args or kwargs}"
+            "a GymnasiumVecEnv holds no single environments to call or change: use "
+            f"`batches`, the vector environments of the GymnasiumVecEnv, got {args or kwargs}"
         )
 
     set_attr = env_method
@@ -186,14 +184,14 @@ class GymnasiumVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[Any], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return False for each environment in `indices`: a batch has no wrappers inside."""
+        """Return False for each environment in `indices`: no environment has a wrapper."""
         return [False for _ in self._get_indices(indices)]
 
 
 def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
-    """Return infos of all environments by name, in arrays of shape (num_envs,).
+    """Return the infos of all vector environments by name, in arrays of shape (num_envs,).
 
-    `infos` holds the infos of each batch. Infos that a batch lacks are left out.
+    An info that any of the vector environments lacks is left out.
     """
     common_names = set(infos[0]).intersection(*infos[1:])
     joined = {}
@@ -204,11 +202,10 @@ def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _infos_of_one(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
-    """Return the info that one environment of a batch would return if it were alone.
+    """Return the info of environment number `row` in a vector environment, as a dict.
 
-    `infos` are the infos of the batch in Gymnasium's form: for each name an array, and under
-    "_name" a mask that says which environments have the info. `row` is the index of the
-    environment in the batch.
+    As in all vector environments of Gymnasium, `infos` holds an array under "name", and under
+    "_name" a mask that says which environments have the info.
     """
     infos_of_one = {}
     for name, values in infos.items():
@@ -229,33 +226,34 @@ def make_vec_env(
     wrapper: Mapping[str, Any] | Callable[..., Any] | None = None,
     **arguments: Any,
 ) -> GymnasiumVecEnv:
-    """Make plants that are stepped together, for the algorithms of Stable-Baselines3.
+    """Return `n_envs` plants, stepped at once, as a `VecEnv` of Stable-Baselines3.
 
     Parameters
     ----------
     env
-        An id or an `EnvSpec`.
+        Id or `EnvSpec` of the environment.
     n_envs
-        Number of plants.
+        Number of plants, each of which is one environment.
     seed
         Seed of the first plant at the first reset; plant i has the seed `seed + i // group`. A
-        model that is made with a seed replaces this seed. None stands for a random seed.
+        model that is made with a seed, as in `PPO(..., seed=1)`, replaces the argument `seed`
+        by the model's seed. If `seed` is None, the seed is random.
     group
-        Number of neighbouring plants that share a seed: plants of a group have the same noise,
-        load and set points, and differ only in the actions that a policy explores.
+        Number of successive plants that share a seed. Plants with the same seed have the same
+        noise, load and set points, and differ only in the random part of the policy's actions.
     wrapper
-        The arguments of an `IncrementalAction` to wrap the plants in, or the class
-        `IncrementalAction` for its default arguments; None for no wrapper. Other wrappers
-        cannot wrap a batch: use `stable_baselines3.common.env_util.make_vec_env`.
+        Arguments of an `IncrementalAction` that wraps the plants, or the class
+        `IncrementalAction` for default arguments, or None for no wrapper. For any other
+        wrapper, use `stable_baselines3.common.env_util.make_vec_env`.
     **arguments
-        Further arguments for the plants, as in `gymnasium.make`. `render_mode` may be
-        "rgb_array".
+        Further arguments of the plants, as in `gymnasium.make`. The argument `render_mode` may
+        be "rgb_array".
 
     Raises
     ------
     ValueError
-        If `env` is not of this package, if it has other wrappers, or if an argument is out of
-        range.
+        If `env` is not an environment of this package, or has wrappers other than
+        `IncrementalAction`. If an argument is out of range.
     """
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)

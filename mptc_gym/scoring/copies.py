@@ -1,9 +1,9 @@
-"""Copy environments layer by layer, so that a policy can act in a copy.
+"""Copy wrapped environments, so that a policy can act in a copy.
 
-A layer is one environment object in a nesting: a wrapper, a vector environment or an innermost
-environment. `copy.deepcopy` alone is not enough: `deepcopy` fails for files and for most
-wrappers of Stable-Baselines3, loses what a `VecNormalize` wraps, and closes the pipes of
-environments in other processes.
+The name `layer` stands for one object of a wrapped environment: a wrapper, a vector environment
+or the innermost environment. `copy.deepcopy` alone is not enough: `deepcopy` fails for open
+files and for most wrappers of Stable-Baselines3, loses the environments in a `VecNormalize`,
+and closes the pipes to worker processes.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from mptc_gym.environments.layers import (
     runs_processes,
 )
 
-# The classes of wrappers that record episodes and change neither observations nor actions: the
-# copy of an environment is without these wrappers.
+# Classes of wrappers that record episodes and change neither observations nor actions. A copied
+# environment has none of these wrappers.
 _RECORDERS: Final = (
     "gymnasium.wrappers.RecordVideo",
     "gymnasium.wrappers.vector.RecordVideo",
     "minari.DataCollector",
     f"{VEC_ENV}.VecVideoRecorder",
 )
-# The classes of a pipe's ends. Only Windows has the class `PipeConnection`.
+# Classes of the two ends of a pipe. Only Windows has the class `PipeConnection`.
 _PIPE_ENDS: Final[set[Any]] = {
     connection.Connection,
     getattr(connection, "PipeConnection", connection.Connection),
@@ -42,11 +42,12 @@ _PIPE_ENDS: Final[set[Any]] = {
 
 
 class Copy:
-    """A copy of an environment and all environments within it, at their present samples.
+    """A copy of an environment with all wrappers, in the present state of the original.
 
-    The copy writes to no file of the original, and closes nothing. Layers that run in other
-    processes, show a window, or raise an error when they are copied are not copied: copy and
-    original share these layers and all layers within them.
+    The copied environment writes to no file of the original environment, and closes nothing
+    when the copy is deleted. A wrapper or environment is shared with the original, and not
+    copied, if the wrapper or environment runs in other processes, shows a window, or raises an
+    error when it is copied. All environments inside a shared wrapper are shared as well.
 
     Parameters
     ----------
@@ -58,22 +59,22 @@ class Copy:
     env : environment
         The copy.
     shared : dict of int to environment
-        The layers that copy and original share, by Python's `id` of the layer.
+        Wrappers and environments that the copy and the original share, by their Python `id`.
     reason : str
-        Why a layer cannot be copied; "" if all layers were copied.
+        Reason why a wrapper or environment is shared; "" if nothing is shared.
     """
 
     def __init__(self, env: Any) -> None:
         self.shared: dict[int, Any] = {}
         self.reason = ""
-        # The argument `memo` of `copy.deepcopy`: each copy by the `id` of its original.
-        # `deepcopy` takes the copies in `memo` instead of copying their originals again.
+        # Argument `memo` of `copy.deepcopy`: each copy by the `id` of the original. `deepcopy`
+        # returns the copies in `memo` instead of copying the originals again.
         self._copies: dict[int, Any] = {}
         with _pipes_refused():
             self.env = self._copy(env)
 
     def _copy(self, layer: Any) -> Any:
-        """Return a copy of a layer and its inner layers; the layer itself if it is shared."""
+        """Return a copy of a wrapper or environment, or the original if it cannot be copied."""
         if id(layer) in self._copies:
             return self._copies[id(layer)]
         copies_of_inner = [self._copy(inner) for inner in inner_environments(layer)]
@@ -96,7 +97,7 @@ class Copy:
         return layer
 
     def _copy_alone(self, layer: Any) -> Any:
-        """Return a copy of a layer, around the copies of its inner layers in `_copies`."""
+        """Return a copy of a wrapper or environment around copies of the inner environments."""
         if inner_environments(layer):
             duplicate = self._copy_attributes(layer)
         else:
@@ -106,10 +107,10 @@ class Copy:
         return duplicate
 
     def _copy_attributes(self, wrapper: Any) -> Any:
-        """Return a copy of a wrapper or a vector environment, attribute by attribute.
+        """Return a copy of a wrapper or vector environment, made by copying each attribute.
 
-        The methods by which wrappers are pickled do not serve: a pickled `VecNormalize` lacks
-        the environment that it wraps.
+        `copy.deepcopy` cannot copy a `VecNormalize`, because `VecNormalize.__getstate__` drops
+        the wrapped environment.
         """
         duplicate = object.__new__(type(wrapper))
         self._copies[id(wrapper)] = duplicate
@@ -117,10 +118,11 @@ class Copy:
         if "results_writer" in attributes:
             attributes["results_writer"] = None  # so that the copy of a monitor writes no file
         if "class_attributes" in attributes:
-            # A VecEnvWrapper has these from its class, so the copy has them, too.
+            # The copy of a VecEnvWrapper has the same class, so `class_attributes` can be
+            # shared.
             class_attributes = attributes["class_attributes"]
             self._copies[id(class_attributes)] = class_attributes
-        # The inner environments come first: a wrapper takes attributes that it lacks from them.
+        # Copy the wrapped environments first: a wrapper looks up missing attributes in them.
         inner_names = [name for name in INNER if name in attributes]
         for name in [*inner_names, *attributes]:
             vars(duplicate)[name] = copy.deepcopy(attributes[name], self._copies)
@@ -129,9 +131,9 @@ class Copy:
 
 @contextmanager
 def _pipes_refused() -> Iterator[None]:
-    """Return a context in which copying the end of a pipe raises a TypeError.
+    """Return a context in which `copy.deepcopy` of the end of a pipe raises a TypeError.
 
-    Without the context, the copy of a pipe closes the original pipe when the copy is deleted.
+    A copied end of a pipe would close the original pipe when the copy is deleted.
     """
     table = copyreg.dispatch_table  # how `copy` and `pickle` treat objects, by class
     treatments_before = dict(table)
@@ -145,16 +147,17 @@ def _pipes_refused() -> Iterator[None]:
 
 
 def _refuse_pipe(_: Any) -> NoReturn:
-    """Raise a TypeError, in place of copying the end of a pipe."""
+    """Raise a TypeError, because the end of a pipe to another process cannot be copied."""
     raise TypeError("a pipe to another process cannot be copied")
 
 
 def _why_not_copied(layer: Any) -> str:
-    """Return why a copy of a layer must not even be tried; "" if a copy may be tried."""
+    """Return why a wrapper or environment must not be copied, or "" if copying may be tried."""
     name = type(layer).__name__
     if runs_processes(layer):
         return f"{name} runs in other processes"
-    # Wrappers around an environment with a window report its render mode "human" as theirs.
+    # A wrapper reports the render mode of the wrapped environment. So the window belongs to the
+    # innermost environment that reports the render mode "human".
     inner = inner_environments(layer)
     inner_modes = [getattr(environment, "render_mode", None) for environment in inner]
     if getattr(layer, "render_mode", None) == "human" and "human" not in inner_modes:

@@ -1,7 +1,8 @@
-"""Refuse environments that a policy was not trained or made for, as far as this is known.
+"""Raise an error if a policy was trained or made for other environments.
 
-A model of Stable-Baselines3 stores the spaces of its training, and a controller in `agents`
-stores the actuator that it was made for. A function stores neither.
+A model of Stable-Baselines3 stores the spaces of the training environments, and a controller in
+`agents` stores the actuator's parameters. A policy that is a plain function stores nothing that
+can be checked.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from mptc_gym.environments.layers import (
 from mptc_gym.scoring.opening import Plants
 from mptc_gym.scoring.policies import form_of
 
-# The classes of Stable-Baselines3 whose objects know the spaces of their training: models, and
-# policies of models.
+# Classes of Stable-Baselines3 whose objects store the spaces of the training environments:
+# models (such as `PPO`), and the policy networks `model.policy`.
 _MODELS: Final = (
     "stable_baselines3.common.base_class.BaseAlgorithm",
     "stable_baselines3.common.policies.BaseModel",
@@ -32,13 +33,7 @@ _MODELS: Final = (
 
 
 def check_fit(policy: Any, plants: Plants) -> None:
-    """Raise a ValueError if a policy cannot be scored in these plants.
-
-    Wrappers that normalise observations must have the statistics of a training, and must not
-    run in other processes. A controller with a method `check_environment` checks the plants by
-    this method. For a model of Stable-Baselines3, the plants must have the spaces, the windows
-    and the wrappers of the model's training.
-    """
+    """Raise a ValueError if a policy cannot be scored in the vector environment `plants`."""
     for layer in layers(plants):
         if runs_processes(layer):
             _check_processes(layer)
@@ -56,42 +51,37 @@ def check_fit(policy: Any, plants: Plants) -> None:
 
 
 def _check_processes(vector_env: Any) -> None:
-    """Raise a ValueError if a wrapper of Gymnasium normalises in other processes.
-
-    `vector_env` is a vector environment that runs its environments in other processes.
-    """
+    """Raise a ValueError if a worker process of `vector_env` has a wrapper that normalises."""
     if any(ask_processes(vector_env, "has_wrapper_attr", "update_running_mean")):
         raise ValueError(
-            "env must not normalise in other processes, where statistics cannot be kept from "
-            "changing: use DummyVecEnv or SyncVectorEnv"
+            "env must not normalise in other processes, where evaluate cannot stop the updates "
+            "of the statistics: use DummyVecEnv or SyncVectorEnv"
         )
 
 
 def _check_statistics(normaliser: Any) -> None:
-    """Raise a ValueError if a wrapper normalises observations by initial statistics.
-
-    Statistics with mean 0 and variance 1 are initial statistics: no training has updated them.
-    """
-    # A wrapper of rewards alone has no statistics of observations.
+    """Raise a ValueError if a wrapper normalises observations by untrained statistics."""
+    # A wrapper that normalises only rewards has no attribute `obs_rms`.
     statistics = vars(normaliser).get("obs_rms", {})
-    # Of dict observations, a VecNormalize has statistics for each part.
+    # For dict observations, a VecNormalize has a dict of statistics.
     parts = statistics.values() if isinstance(statistics, dict) else [statistics]
     for part in parts:
         if not part.mean.any() and (part.var == 1.0).all():
             raise ValueError(
-                f"env must have the statistics of the training in {type(normaliser).__name__}, "
-                "got initial statistics: load or copy the statistics of the training"
+                "env must have the normalisation statistics of the policy's training in "
+                f"{type(normaliser).__name__}, got initial statistics (mean 0, variance 1): "
+                "load or copy the statistics of the training"
             )
 
 
 def _check_training(model: Any, plants: Plants) -> None:
-    """Raise a ValueError if plants differ from those with which a model was trained.
+    """Raise a ValueError if plants differ from the plants of a model's training.
 
-    `model` is a model of Stable-Baselines3, or the attribute `policy` of a model. Windows and
-    wrappers are compared only if the model still has the environments of its training.
+    Observation windows and wrappers are compared only if the model still has the training
+    environments.
     """
     training = getattr(model, "env", None)
-    # The list is empty if the environments of the training are in processes that are closed.
+    # The list is empty if the training environments ran in processes that are now closed.
     training_groups = plant_groups(training) if is_environment(training) else []
     if training_groups:
         groups = plant_groups(plants)
@@ -105,29 +95,26 @@ def _check_training(model: Any, plants: Plants) -> None:
             {" of ".join(group.wrappers) or "none" for group in training_groups},
             {" of ".join(group.wrappers) or "none" for group in groups},
         )
-    # Spaces are in lists, as sets cannot hold them.
+    # Spaces are passed in lists, because a space is not hashable.
     _compare("observation space", [model.observation_space], [plants.single_observation_space])
     _compare("action space", [model.action_space], [plants.single_action_space])
 
 
 def _compare(name: str, of_training: Collection[Any], of_env: Collection[Any]) -> None:
-    """Raise a ValueError if a property of a model's training and of `env` has other values.
-
-    `name` is the name of the property, such as "action space".
-    """
+    """Raise a ValueError if `env` and the training environments differ in a property."""
     if of_training == of_env:
         return
     expected = " and ".join(sorted(map(_in_words, of_training)))
     received = " and ".join(sorted(map(_in_words, of_env)))
     raise ValueError(
         f"env must have the {name} of policy's training, {expected}, got {received}: use "
-        "evaluate(model, model.get_env()), or spec_of(model, id) of mptc_gym.sb3, in the same "
-        "VecNormalize and VecFrameStack"
+        "evaluate(model, model.get_env()), or spec_of(model, id) of mptc_gym.sb3, and wrap env "
+        "in each VecNormalize and VecFrameStack of the training"
     )
 
 
 def _in_words(value: Any) -> str:
-    """Return a value as text for a message: of a `Box`, the shape and the extreme bounds."""
+    """Return a value as text for an error message; for a `Box`, the shape and the bounds."""
     if not isinstance(value, Box):
         return str(value)
     return f"shape {value.shape} within {value.low.min():g} to {value.high.max():g}"

@@ -1,7 +1,7 @@
-"""Open environments of any kind as one vector environment of Gymnasium to act in.
+"""Turn the argument `env` of `evaluate` into one vector environment of Gymnasium.
 
-Environments of any kind are an id, a spec (`EnvSpec`), a function that makes an environment,
-and environments of Gymnasium or Stable-Baselines3.
+`env` is an id, a spec (`EnvSpec`), a function that makes an environment, or environments of
+Gymnasium or Stable-Baselines3.
 """
 
 from __future__ import annotations
@@ -29,50 +29,35 @@ from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.policies import form_of
 from mptc_gym.scoring.rollout import infos_in_arrays
 
-_POLICY_OF_A_MODEL: Final = "stable_baselines3.common.policies.BaseModel"
+# Class of the attribute `policy` of a Stable-Baselines3 model.
+_POLICY_NETWORK: Final = "stable_baselines3.common.policies.BaseModel"
 
-# A vector environment of Gymnasium. It has no type `VectorEnv` here, as the method `reset` of
-# this type takes no list of seeds.
+# A vector environment of Gymnasium. The annotation is not `VectorEnv`, because the annotated
+# method `VectorEnv.reset` takes no list of seeds.
 Plants = Any
 
 
 @contextmanager
 def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plants]:
-    """Return a context with a vector environment for a policy to act in.
+    """Return a context manager that yields a vector environment in which a policy can act.
 
-    In the context, wrappers that normalise do not update their statistics.
+    The forms of `env` and `policy` are those that `mptc_gym.evaluate` takes. If `env` is an id,
+    a spec or a function, n plants are made, and closed at the end of the context. If `env` is
+    an environment, the policy acts in a copy. An environment that cannot be copied is used
+    directly, and is reset at the end of the context. Within the context, no wrapper updates
+    normalisation statistics.
 
-    Parameters
-    ----------
-    env
-        As in `mptc_gym.evaluate`. From an id, a spec or a function, environments are made,
-        which are closed at the end of the context. Environments are copied; those that cannot
-        be copied are used themselves, and begin a new episode at the end of the context.
-    n
-        Number of plants to make, if `env` is an id, a spec or a function.
-    policy
-        As in `mptc_gym.evaluate`.
-    **arguments
-        Further arguments for an id or a spec, as in `gymnasium.make`.
-
-    Yields
-    ------
-    VectorEnv
-        A vector environment of Gymnasium, whose plants are those of `env`.
-
-    Raises
-    ------
-    ValueError
-        If `env` or `policy` is of another kind; if `env` holds no plants of this package in
-        NumPy; or if `env` cannot be copied and is the environment in which `policy` trains.
+    A ValueError is raised if `evaluate` does not take the form of `env` or `policy`, if `env`
+    holds no NumPy environments of this package, or if `env` is the training environment of
+    `policy` and cannot be copied.
     """
     target = form_of(policy).target
     if arguments and not isinstance(env, str | EnvSpec):
         raise ValueError(
             f"{', '.join(arguments)} must be given where env is made: evaluate takes arguments "
-            "of the plant only with an id or a spec"
+            "of the plant only if env is an id or an EnvSpec"
         )
-    with ExitStack() as stack:  # which undoes all steps of opening, the last step first
+    with ExitStack() as stack:  # which undoes the steps below, the last step first
         if is_environment(env):
             copy = Copy(env)
             _refuse_training_environments(copy, target)
@@ -85,7 +70,7 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
         if not plant_groups(plants):
             allowed = "of MiddlePointEnv in NumPy, and open, such as an id or a spec of it"
             reject("env", env, allowed)
-        if originals_act:  # in layers that could not be copied, within copies of other layers
+        if originals_act:  # as at least one object of `env` could not be copied
             stack.enter_context(_statistics_frozen(env))
             stack.callback(_as_vector(env).reset, seed=_next_seeds(plants))
         stack.enter_context(_statistics_frozen(plants))
@@ -93,10 +78,7 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
 
 
 def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
-    """Return a vector environment with n plants, made by an id, a spec or a function `env`.
-
-    `arguments` are further arguments of `gymnasium.make` for an id or a spec.
-    """
+    """Return a vector environment with n plants, made from an id, a spec or a function."""
     if isinstance(env, str | EnvSpec):
         single = make_one(env, arguments)
         batch = make_batch(single, n)
@@ -116,44 +98,44 @@ def _make(env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
 
 def _sync_vector_env(environments: list[Env]) -> Plants:
     """Return a vector environment that steps the given environments one after another."""
-    # SyncVectorEnv takes functions that make environments. The default argument keeps the
-    # environment of each function.
+    # SyncVectorEnv takes functions that make environments. The default argument binds each
+    # function to a different environment.
     return SyncVectorEnv([lambda env=env: env for env in environments])  # type: ignore[misc]
 
 
 def _as_vector(env: Any) -> Plants:
-    """Return an environment or a vector environment as a vector environment of Gymnasium."""
+    """Return a single environment, or a `VecEnv`, as a vector environment of Gymnasium."""
     if isinstance(env, VectorEnv):
         return env
     if not isinstance(env, gymnasium.Env):
         return _FromVecEnv(env)
     plants = _sync_vector_env([env])
-    # Some versions of Gymnasium close the environments within a vector environment when the
-    # vector environment is deleted, unless it is closed.
+    # Some versions of Gymnasium close the inner environments of a vector environment when the
+    # vector environment is deleted, unless the vector environment is marked as closed.
     plants.closed = True
     return plants
 
 
 class _FromVecEnv(VectorEnv[Any, Any, Any]):
-    """A `VecEnv` of Stable-Baselines3 as a vector environment of Gymnasium."""
+    """A vector environment of Gymnasium that wraps a `VecEnv` of Stable-Baselines3."""
 
     def __init__(self, venv: Any) -> None:
         self.venv = venv
         self.num_envs = venv.num_envs
         self.single_observation_space = venv.observation_space
         self.single_action_space = venv.action_space
-        self.closed = True  # so that only the user closes the environments of the user
+        self.closed = True  # so that deleting this object does not close the `VecEnv`
 
     @property
     def np_random_seed(self) -> Any:
-        """A list of the latest seed of each plant."""
+        """The latest seeds of all plants, in a list."""
         return self.venv.get_attr("np_random_seed")
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Reset all plants, and return observations and infos, both in arrays.
 
-        `seed` is a list with a seed for each plant. Only a `GymnasiumVecEnv` takes all seeds.
-        Any other `VecEnv` takes the first seed, and gives the next integers to the next plants.
+        A `GymnasiumVecEnv` uses all seeds of the list `seed`, one for each plant. Any other
+        `VecEnv` uses only the first seed, and gives plant i the first seed + i.
         """
         innermost = self.venv.unwrapped
         if hasattr(innermost, "set_seeds"):
@@ -164,9 +146,9 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
         return observations, {**infos_in_arrays(innermost.reset_infos)}
 
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all plants, and return observations, rewards, flags and infos, all in arrays.
+        """Step all plants; return observations, rewards, `terminated`, `truncated` and infos.
 
-        The flags say which episodes have ended. All ended episodes count as terminated.
+        Every episode that has ended counts as terminated, and none as truncated.
         """
         observations, rewards, ended, infos = self.venv.step(actions)
         # A `GymnasiumVecEnv` fills its list of infos only where episodes end, and has the infos
@@ -176,32 +158,35 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
 
 
 def _refuse_training_environments(copy: Copy, target: Any) -> None:
-    """Raise a ValueError if a policy may train in layers that copy and original share.
+    """Raise a ValueError if a policy may train in an environment that was not copied.
 
-    `target` is the model or another object behind the policy. The attribute `policy` of a model
-    of Stable-Baselines3 does not know the model's environments, so it may train in any.
+    `target` is the policy, or the object of the policy if the policy is a bound method. A
+    policy network `model.policy` does not know the training environments of the model, so for a
+    policy network, the error is raised for any environment that was not copied.
     """
     training = getattr(target, "env", None)
     trains_there = is_environment(training) and any(
-        id(layer) in copy.shared for layer in layers(training)
+        id(wrapper_or_environment) in copy.shared for wrapper_or_environment in layers(training)
     )
-    is_policy_of_a_model = isinstance(target, loaded(_POLICY_OF_A_MODEL))
-    if trains_there or (copy.shared and is_policy_of_a_model):
+    # `loaded` returns the class if its module has been imported, and () otherwise.
+    is_policy_network = isinstance(target, loaded(_POLICY_NETWORK))
+    if trains_there or (copy.shared and is_policy_network):
         raise ValueError(
             "env must not be the training environments of policy, as these cannot be copied "
-            f"({copy.reason}): make others like them, and pass the model itself, or use "
-            "evaluate(model, spec_of(model, id)), with spec_of from mptc_gym.sb3"
+            f"({copy.reason}): make others like them, and pass the model itself, not "
+            "model.policy, or use evaluate(model, spec_of(model, id)) with mptc_gym.sb3.spec_of"
         )
 
 
 def _next_seeds(plants: Plants) -> list[int]:
-    """Return a seed for a new episode of each plant, computed from the present seeds.
+    """Return a seed for the next episode of each plant, computed from the present seeds.
 
-    Without new seeds, a user's environments would continue the random numbers of the scored
-    episodes. The new seeds are not random, so that a user can repeat a program.
+    After an evaluation, a user's environments need new seeds, because otherwise the random
+    numbers would follow those of the scored episodes. The new seeds depend only on the present
+    seeds, so a program that is run again gives the same results.
     """
     present_seeds = np.ravel(plants.unwrapped.np_random_seed).tolist()
-    # A SeedSequence takes no negative number, which is Gymnasium's value for an unknown seed.
+    # Gymnasium marks an unknown seed by -1, and a SeedSequence takes no negative number.
     entropy = [abs(seed) for seed in present_seeds if seed is not None]
     seeds: list[int] = np.random.SeedSequence(entropy).generate_state(plants.num_envs).tolist()
     return seeds
@@ -209,12 +194,12 @@ def _next_seeds(plants: Plants) -> list[int]:
 
 @contextmanager
 def _statistics_frozen(env: Any) -> Iterator[None]:
-    """Return a context in which no wrapper of an environment updates its statistics."""
+    """Return a context in which no wrapper of `env` updates normalisation statistics."""
     with ExitStack() as stack:
         for layer in layers(env):
-            flag = normaliser_flag(layer)  # name of an attribute; "" if there are no statistics
+            flag = normaliser_flag(layer)  # name of an attribute, or ""
             if flag:
-                # Put the present value back at the end of the context.
+                # Restore the present value of the flag at the end of the context.
                 stack.callback(setattr, layer, flag, getattr(layer, flag))
                 setattr(layer, flag, False)
         yield

@@ -1,8 +1,9 @@
-"""Call a policy in any of its four forms as a function of observations.
+"""Turn a policy of any form into a function from observations to actions.
 
-A policy is an object with `predict`, as in Stable-Baselines3; an object with `act`; a
-`torch.nn.Module`; or a function of NumPy arrays. A bound method `predict` or `act` stands for
-the object of the method, and a `functools.partial` for the function within the partial.
+A policy is an object with a method `predict` (as in Stable-Baselines3) or `act`, a
+`torch.nn.Module`, or a function of NumPy arrays. A bound method `model.predict` or
+`controller.act` is treated as the object `model` or `controller`, and a `functools.partial` is
+treated as the function within the partial.
 """
 
 from __future__ import annotations
@@ -19,31 +20,32 @@ import numpy as np
 from mptc_gym.environments.layers import is_environment, loaded
 from mptc_gym.plant.checks import reject
 
-# A function of observations, with a row for each plant, that returns actions, with a row for
-# each plant.
+# A function that takes observations and returns actions, both with a row for each plant.
 Act = Callable[[Any], Any]
-# Methods that make an object a policy. If an object has both methods, the first one is called.
+# Methods that make an object a policy. If an object has both methods, `predict` is called.
 _METHODS: Final = ("predict", "act")
-# Held while a PyTorch module is called: several threads may call the module, and each call
-# changes whether the module is in evaluation mode.
+# Held during each call of a PyTorch module. A call sets the module to evaluation mode and back,
+# so two threads must not call a module at the same time.
 _MODULE_LOCK: Final = threading.RLock()
 
 
 class Form(NamedTuple):
-    """How a policy is called, and on which object."""
+    """The function that calls a policy, and the objects that have this function."""
 
     function: Callable[..., Any]  # the function to call with observations
     method: str  # "predict" or "act" if `function` is this method; otherwise ""
-    # The object with the method `predict` or `act`, or else the function within all partials.
+    # The object whose method `predict` or `act` is called, or else the function that is called,
+    # without any `functools.partial` around the function.
     target: Any
     # The torch.nn.Module that the policy is, or whose method the policy is; otherwise None.
     module: Any
 
 
 def form_of(policy: Any) -> Form:
-    """Return how a policy of any form that `evaluate` takes is called, and on which object.
+    """Return the function that calls a policy, and the objects that have this function.
 
-    A ValueError is raised if the policy has none of these forms.
+    A ValueError is raised if `policy` is an environment, a class, or neither a function nor an
+    object with a method `predict` or `act`.
     """
     if is_environment(policy):
         reject("policy", policy, "a policy, which comes first: evaluate(policy, env)")
@@ -67,11 +69,11 @@ def form_of(policy: Any) -> Form:
 
 
 def start(policy: Any, n: int) -> Act:
-    """Reset a policy, and return it as a function for one episode of n plants.
+    """Reset a policy, and return a function that acts in one episode of n plants.
 
-    The function takes observations in NumPy arrays, and returns the actions of the policy, both
-    with a row for each plant. The method `reset()` is called if the policy is an object with
-    this method, or the bound method `predict` or `act` of an object with this method.
+    The returned function takes observations in NumPy arrays and returns actions, both with a
+    row for each plant. If the policy, or the object of a bound method `predict` or `act`, has a
+    method `reset`, `start` calls `reset`.
     """
     form = form_of(policy)
     reset = getattr(form.target, "reset", None)
@@ -88,12 +90,12 @@ def start(policy: Any, n: int) -> Act:
 
 
 def _act_by_predict(predict: Callable[..., Any], n: int) -> Act:
-    """Return a function of observations that calls `predict` as Stable-Baselines3 does.
+    """Return a function from observations to actions that calls the method `predict`.
 
-    The function serves for one episode of n plants. The state that `predict` returns, such as
-    the state of a recurrent network, is passed to the next call of `predict`. `predict` gets
-    the keywords `state`, `episode_start` and `deterministic=True`, without keywords that it
-    does not take, and without keywords that a `functools.partial` has set.
+    The returned function can be used for one episode of n plants. The state that `predict`
+    returns, such as the state of a recurrent network, is passed to the next call of `predict`.
+    Of the keywords `state`, `episode_start` and `deterministic=True`, `predict` receives those
+    that `predict` takes and that no `functools.partial` has set.
     """
     parameters = inspect.signature(predict).parameters
     takes_any_keyword = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
@@ -104,7 +106,7 @@ def _act_by_predict(predict: Callable[..., Any], n: int) -> Act:
             del keywords[name]
 
     def act(observations: Any) -> Any:
-        """Return the actions that `predict` returns, and keep the state for the next call."""
+        """Return the actions from `predict`, and keep the returned state for the next call."""
         returned = predict(observations, **keywords)
         if "episode_start" in keywords:
             keywords["episode_start"] = np.zeros(n, np.bool_)
@@ -119,16 +121,16 @@ def _act_by_predict(predict: Callable[..., Any], n: int) -> Act:
 
 
 def _act_on_tensors(call: Callable[[Any], Any], module: Any) -> Act:
-    """Return a function of NumPy arrays that calls a PyTorch module with tensors.
+    """Return a function that converts NumPy arrays to tensors and calls a PyTorch module.
 
-    `call` is the module or a method of the module. The tensors have the type and the device of
-    the module's weights. If the module has no weights, the tensors are of float32 on the CPU.
+    The tensors have the type and the device of the module's weights. If the module has no
+    weights, the tensors are of float32 on the CPU.
     """
     torch: Any = sys.modules["torch"]  # not imported, as this package does not depend on it
     weights = next(module.parameters(), torch.empty(0))
 
     def to_tensors(observations: Any) -> Any:
-        """Return observations as tensors: an array, or arrays in a dict or a tuple."""
+        """Return an array, or the arrays in a dict or a tuple, as tensors."""
         if isinstance(observations, Mapping):
             return {name: to_tensors(part) for name, part in observations.items()}
         if isinstance(observations, tuple):
@@ -139,32 +141,34 @@ def _act_on_tensors(call: Callable[[Any], Any], module: Any) -> Act:
 
 
 def _act_in_evaluation_mode(act: Act, module: Any) -> Act:
-    """Return a function that calls `act` with a PyTorch module in evaluation mode.
+    """Return a function that calls `act` while a PyTorch module is in evaluation mode.
 
-    `act` calls the module. PyTorch computes no gradients meanwhile, and each part of the module
-    is put back into its mode after each call. The actions are returned as a NumPy array, even
-    if `act` returns a tensor.
+    PyTorch computes no gradients during a call of `act`. After each call of `act`, each part of
+    the module returns to the part's previous mode. The actions are returned as a NumPy array,
+    even if `act` returns a tensor.
     """
     torch: Any = sys.modules["torch"]
     parts = [part for part in module.modules() if hasattr(part, "training")]
     set_mode = module.train
     arguments = inspect.signature(set_mode).parameters.values()
     default_mode = next((argument.default for argument in arguments), None)
-    if default_mode is not True:  # this `train` trains, unlike `train(mode=True)` of PyTorch
+    if default_mode is not True:  # the module has a `train` method of another meaning
         set_mode = partial(torch.nn.Module.train, module)
 
     def evaluating_act(observations: Any) -> Any:
-        """Return the actions of `act`, called in evaluation mode and without gradients."""
+        """Return the actions of `act` with the module in evaluation mode, without gradients."""
         with _MODULE_LOCK, torch.no_grad():
-            is_training = getattr(module, "training", False)  # a frozen script has no flag
+            # A frozen TorchScript module has no attribute `training`.
+            is_training = getattr(module, "training", False)
             flags = [part.training for part in parts]
             set_mode(False)
             try:
                 actions = act(observations)
             finally:
-                set_mode(is_training)  # for what a `train` of the module's own may change
+                set_mode(is_training)  # undoes what the module's own `train` has changed
                 for part, flag in zip(parts, flags, strict=True):
-                    if part.training != flag:  # as PyTorch takes long to set an attribute
+                    # Setting an attribute of a PyTorch module is slow.
+                    if part.training != flag:
                         part.training = flag
         if isinstance(actions, torch.Tensor):
             return np.array(actions.tolist())  # for tensors of any type, on any device

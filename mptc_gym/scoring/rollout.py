@@ -1,4 +1,4 @@
-"""Step a policy through a vector environment, and check that the episodes are as expected."""
+"""Run a policy in a vector environment, and check that the episodes belong to their seeds."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from mptc_gym.plant.parameters import Parameters
 from mptc_gym.scoring.policies import Act
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
-# An info may differ from the expected info by this number times (1 + |expected info|): far more
-# than rounding errors, and far less than any change of the plant.
+# Largest difference between an info and the expected info, divided by (1 + |expected info|):
+# far more than rounding errors, and far less than the effect of another plant or seed.
 _TOLERANCE: Final = 1e-6
 
 Infos = Mapping[str, Any]  # infos of n plants by name, in arrays of shape (n,)
 
 
 class Sample(NamedTuple):
-    """What n plants return at one sample k."""
+    """Observations and infos of n plants at one sample k."""
 
     observations: Any  # one row for each plant, as the policy receives them
     infos: Infos  # infos of sample k; at the end of an episode, not those of the next episode
@@ -31,46 +31,34 @@ class Sample(NamedTuple):
 
 
 def rollout(env: Any, act: Act, samples: int, seeds: list[int]) -> Iterator[Sample]:
-    """Reset plants, step the plants with the actions of a policy, and yield the samples.
+    """Yield the samples of n plants that a policy controls, beginning with a reset.
 
-    Parameters
-    ----------
-    env
-        A vector environment of Gymnasium with n plants.
-    act
-        The policy, as a function from observations to actions, both with a row for each plant.
-    samples
-        Number N of steps: N + 1 samples are yielded, k = 0, 1, ..., N.
-    seeds
-        The seeds of the n episodes.
-
-    Raises
-    ------
-    ValueError
-        If `env` cannot begin another episode, or if an action is not finite or of another shape
-        than that of the action space.
+    `env` is a vector environment of Gymnasium with a plant for each seed. The samples k = 0, 1,
+    ..., N are yielded, where N is the argument `samples`. A ValueError is raised if `env` does
+    not allow a reset, or if the policy returns actions that are not finite or do not have the
+    shape of the action space.
     """
     try:
         observations, infos = env.reset(seed=seeds)
     except RuntimeError as error:  # from a Monitor that does not allow early resets
-        raise ValueError(f"env must allow another episode: {error}") from error
+        raise ValueError(f"env must allow a reset in mid-episode: {error}") from error
     yield Sample(observations, infos_in_arrays(infos), np.zeros(len(seeds), np.bool_))
     shape = (len(seeds), *env.single_action_space.shape)
     for _ in range(samples):
         actions = _checked_actions(act(observations), shape)
         observations, _, terminated, truncated, infos = env.step(actions)
         arrays = infos_in_arrays(infos)
-        # Where an episode ends, some environments return infos of the next episode, and put
-        # those of the last sample into "final_info".
+        # At the end of an episode, some environments return the infos of the next episode, and
+        # put the infos of the last sample into "final_info".
         infos_of_sample = arrays.get("final_info", arrays)
         yield Sample(observations, infos_of_sample, terminated | truncated)
 
 
 def infos_in_arrays(infos: Any) -> Infos:
-    """Return the infos of n plants by name, in arrays of shape (n,).
+    """Return the infos of n plants as a dict from names to arrays of shape (n,).
 
-    `infos` is a dict of arrays, which is returned as it is, or a list with a dict for each
-    plant. From a list, only numbers are taken, and NaN for a plant without a number of a name.
+    A dict `infos` is returned unchanged. A list `infos` holds a dict for each plant; only
+    numbers are taken from the dicts, and a number that a plant lacks becomes NaN.
     """
     if isinstance(infos, Mapping):
         return infos
@@ -79,9 +67,9 @@ def infos_in_arrays(infos: Any) -> Infos:
 
 
 def _checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return the actions of a policy as an array, after checking that plants can take them.
+    """Return the actions of a policy as an array, after a check of shape and values.
 
-    A ValueError is raised if the actions are not finite numbers of the shape `shape`.
+    A ValueError is raised if the actions are not finite numbers in an array of shape `shape`.
     """
     if isinstance(actions, tuple):
         allowed = (
@@ -90,7 +78,7 @@ def _checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
         )
         reject("policy", actions, allowed)
     try:
-        checked = np.asarray(actions)  # which drops the mask of a masked array
+        checked = np.asarray(actions)  # `asarray` drops the mask of a masked array
         is_masked = np.ma.is_masked(actions)
         if checked.shape == shape and np.isfinite(checked).all() and not is_masked:
             return checked
@@ -103,16 +91,16 @@ def _checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 def replayed(
     samples: Iterator[Sample], parameters: Parameters, seeds: list[int]
 ) -> Iterator[Sample]:
-    """Yield the samples of a rollout, and check that they belong to the seeds' episodes.
+    """Yield the samples of a rollout, and compare each sample with a second simulation.
 
-    For the check, a `MiddlePointVectorEnv` with the same arguments and seeds receives the
-    commands of the rollout. A ValueError is raised if its infos differ from those of the
-    rollout, because the environment of the rollout has reseeded, skipped samples, or changed
-    the plant or the infos.
+    The second simulation is a `MiddlePointVectorEnv` with the arguments, the seeds and the
+    commands of the rollout. A ValueError is raised if the infos of rollout and second
+    simulation differ, because the environment of the rollout has changed the seed, skipped
+    samples, or changed the plant or the infos.
     """
     plants = MiddlePointVectorEnv(len(seeds), **asdict(parameters))
     _, expected = plants.reset(seed=seeds)
-    # Limits of the actuator that are sampled for each episode are infos of the reset.
+    # If the actuator's limits are drawn for each episode, the infos of the reset hold them.
     u_min = expected.get("u_min", parameters.u_min)
     u_max = expected.get("u_max", parameters.u_max)
     for k, sample in enumerate(samples):
@@ -120,21 +108,21 @@ def replayed(
             commands = np.asarray(sample.infos.get("command", np.zeros(len(seeds))))
             actions = action_from_command(commands, u_min, u_max)[:, np.newaxis]
             expected = plants.step(actions)[-1]
-        if k > 0 or sample.infos:  # some environments have no infos of a reset
+        if k > 0 or sample.infos:  # some environments return no infos at a reset
             _compare_infos(sample.infos, expected, k)
         yield sample
 
 
 def _compare_infos(infos: Infos, expected: Infos, k: int) -> None:
-    """Raise a ValueError if the infos of n plants at sample k differ from the expected ones."""
-    names = [name for name in expected if not name.startswith("_")]  # those with "_" are masks
-    # The last names come first: they are the plants' numbers that are sampled for an episode,
-    # and a difference in these numbers explains differences in other infos.
+    """Raise a ValueError if infos of n plants at sample k differ from the expected infos."""
+    names = [name for name in expected if not name.startswith("_")]  # "_name" is a mask
+    # Compare the last names first: the last infos are the plant parameters that are drawn for
+    # the episode, and a difference in a parameter explains differences in other infos.
     for name in reversed(names):
         differences = np.abs(infos.get(name, np.nan) - expected[name])
         if not (differences <= _TOLERANCE * (1.0 + np.abs(expected[name]))).all():
             raise ValueError(
                 f"env must run the episodes of its seeds, whose {name} at sample {k} is "
-                f"{shorten(expected[name])}, got {shorten(infos.get(name))}: it must not reset "
-                "with another seed, skip or repeat samples, or change the plant or info"
+                f"{shorten(expected[name])}, got {shorten(infos.get(name))}: env must not "
+                "reset with another seed, skip or repeat samples, or change the plant or infos"
             )
