@@ -24,10 +24,10 @@ PLANTS: dict[str, Any] = {"": {}, ", R = 0.5": PRESETS["noisy"], ", hard": PRESE
 
 
 class Case(NamedTuple):
-    """A function that steps an environment, and the number of steps."""
+    """A function that steps an environment, and the number of steps in a call."""
 
     run: Callable[[], object]  # the function
-    steps: int  # number of steps in a call of the function, summed over all plants
+    steps: int  # summed over all plants
 
 
 @options
@@ -35,8 +35,8 @@ class Case(NamedTuple):
 class Options:
     """Compare the steps a second of the environments with those of Gymnasium's CartPole.
 
-    Each environment is timed several times, in rounds. The ratio of two environments is the
-    median over rounds of the ratio in the same round.
+    In each round, all environments are timed once. The ratio to CartPole compares the steps a
+    second of the same round.
     """
 
     rounds: Runs = 15
@@ -132,9 +132,9 @@ def stepping(env: Any) -> Case:
 def compare(cases: Mapping[str, Case], rounds: int) -> Any:
     """Measure the speed of each case in `rounds` rounds, and return a DataFrame of text.
 
-    Each case is timed once in each round. A row of the DataFrame has the name of a case; the
-    median of the steps per second; and the ratio of the steps per second to those of the first
-    case in the same round, as the median with the 10th and the 90th percentile in parentheses.
+    Each case is timed once in each round. A row of the DataFrame has the name of a case, the
+    median of the steps per second, and the ratio to the first case. The ratio is the median,
+    with the 10th and the 90th percentile in parentheses, of the ratios in the same round.
     """
     import pandas as pd  # imported here, as pandas would slow `--help` down
 

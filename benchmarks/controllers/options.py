@@ -174,10 +174,7 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
 
 
 def _with_searched_gains(name: str, file: Path) -> ControllerSpec:
-    """Return the record of a controller with gains from `file`, written by `benchmarks.tune`.
-
-    `name` is the user's name for the controller.
-    """
+    """Return the `ControllerSpec` of a controller with gains from a `benchmarks.tune` file."""
     content = json.loads(file.read_text(encoding="utf-8"))
     return replace(
         ROSTER[content["controller"]].with_gains(content["gains"]),
@@ -190,10 +187,9 @@ def _with_searched_gains(name: str, file: Path) -> ControllerSpec:
 
 
 def _with_trained_networks(name: str, files: Sequence[str]) -> ControllerSpec:
-    """Return the record of a controller with policies that `benchmarks.train ppo` has trained.
+    """Return the `ControllerSpec` of a controller with policies from NPZ files.
 
-    `name` is the user's name for the controller. Each element of `files` is the path of an NPZ
-    file with one policy.
+    Each of `files` contains one policy that `python -m benchmarks.train ppo` has trained.
     """
     networks = {file: PolicyNetwork.load(Path(file)) for file in files}
     provenance = networks[files[0]].provenance

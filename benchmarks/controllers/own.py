@@ -116,7 +116,7 @@ def blame_user(controller: str, step: str) -> Iterator[None]:
     controller
         Value of the option `--agent`, in the form NAME=LOCATION.
     step
-        Last word of "cannot be loaded", "cannot be made" or "cannot be run" in the message.
+        What failed, for the message: "loaded", "made" or "run".
     """
     try:
         yield
@@ -277,7 +277,9 @@ class PolicyAgent:
         case = case_of(Parameters(**arguments))
         with self._open({**arguments, "max_episode_steps": samples}) as plants:
             if any(case_of(group.parameters) != case for group in plant_groups(plants)):
-                raise ValueError("the environment must have the parameters of the case")
+                raise ValueError(
+                    "the policy's environment must have the case's plant and set point"
+                )
             check_fit(self.policy, plants)
             yield plants
 

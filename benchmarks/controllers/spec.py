@@ -49,7 +49,7 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
     runs
         Number of runs that the controller controls at once.
     seed
-        Seed of the controller's random numbers in the first run; run i uses `seed + i`.
+        Seed of the controller's random numbers in the first run; run i has the seed `seed + i`.
     """
     values: dict[str, Any] = {"parameters": plant, "num_envs": runs, "seed": seed}
     values["u_min"] = plant.range_of("u_min")[0]
@@ -92,7 +92,7 @@ def setpoint_holds(plant: Parameters) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSpec:
-    """The record of a controller: everything that commands need to run and describe one.
+    """The record of a controller: everything that commands need to run and describe it.
 
     The nominal plant has the middle value of each environment argument that is a range.
 
@@ -111,10 +111,10 @@ class ControllerSpec:
         Names of the quantities of the plant that the controller knows, as listed in the
         docstring of the function `knowledge`.
     knows : str
-        Description of the controller's prior knowledge in tables.
+        Text for tables that describes the prior knowledge of the controller.
     searched : str
-        Description, in tables, of the search or training before a comparison, with the number
-        of trials and samples.
+        Text for tables that says what was searched or trained before a comparison, and in how
+        many trials and samples.
     tuned_by : str
         Name of the argument of `build`, a time constant in s, that is chosen so that the
         maximum sensitivity of the control loop is `sensitivity`; "" if no argument is chosen.
@@ -123,20 +123,21 @@ class ControllerSpec:
         of the loop's sensitivity function.
     linear : bool
         Whether the controller is linear for commands outside the dead zone and within the
-        limits. A linear controller has a method `transfer` that returns its transfer function.
+        limits. A linear controller has a method `transfer`, which returns the transfer function
+        of the controller.
     assumes : sequence of str
         Properties in which the plant must agree with `made_for`: "direction" (the sign of the
         gain) or "scale" (the magnitudes of gain, reachable temperature, time constant and
         delay).
     made_for : mapping
-        Arguments of the environment with the plant that the controller was made for; empty for
-        the paper's plant.
+        Arguments of the environment for which the controller was made; empty for the paper's
+        plant.
     observation : mapping
         Number of samples of each signal that the controller observes, by the environment's
         arguments, such as `{"error_window": 3}`.
     networks : callable, optional
-        Function that returns the controller's trained networks by file name. The controller has
-        one member for each network, and a command runs all members.
+        Function that returns the controller's trained networks by file name. A member of the
+        controller is the controller with one of the networks; commands run all members.
     networks_are_alike : bool
         Whether the trained networks hardly differ, so that most comparisons run only one.
     random : bool
@@ -145,8 +146,8 @@ class ControllerSpec:
         Whether the controller goes on learning from one run to the next.
     spans : callable, optional
         Function that takes a plant, and returns the interval in which a search looks for each
-        gain. The first end of an interval has the smaller magnitude, and both ends have the
-        same sign.
+        gain. Both ends of the interval have the same sign, and the first end has the smaller
+        magnitude.
     compared : bool
         Whether the command `compare` runs the controller by default.
     swept : bool
@@ -154,7 +155,7 @@ class ControllerSpec:
     pictured : bool
         Whether comparisons draw the temperature and the flow of the controller over time.
     provenance : mapping
-        Origin of the trained network of a member, as a mapping that JSON can store; empty if
+        Mapping that says how the network of a member was trained, for a JSON file; empty if
         nothing was trained.
     """
 
@@ -237,11 +238,11 @@ class ControllerSpec:
         return self.build(**arguments)
 
     def robust_time_constant(self, plant: Mapping[str, Any]) -> float:
-        """Return the smallest time constant `tuned_by`, s, with an Ms of at most `sensitivity`.
+        """Return the smallest time constant, s, with a maximum sensitivity of `sensitivity`.
 
-        Ms is the maximum sensitivity of the control loop with the nominal plant. The dict
-        `plant` has arguments of the environment. The returned time constant is rounded to four
-        digits, so that all machines return the same number.
+        The time constant is that of the argument `tuned_by` of `build`, and the maximum
+        sensitivity is that of the control loop with the nominal plant. The time constant is
+        rounded to four digits, so that all machines return the same number.
         """
         parameters = Parameters(**plant)
         arguments = knowledge(self.prior_knowledge, parameters, 1, 0)
@@ -257,10 +258,7 @@ class ControllerSpec:
         return float(f"{exact:.4g}")
 
     def loop(self, plant: Mapping[str, Any]) -> LinearLoop:
-        """Return the control loop of this linear controller with the nominal plant.
-
-        The dict `plant` has arguments of the environment.
-        """
+        """Return the control loop of this linear controller with the nominal plant."""
         controller: Any = self.make(plant, 1, 0)
         return LinearLoop.of(controller, nominal(Parameters(**plant)))
 
@@ -318,7 +316,7 @@ class ControllerSpec:
         """Return a controller for `runs` runs that has learnt on `plant`, if it can learn.
 
         A controller that learns is first run on `plant` for `LEARNING` samples of the square
-        wave. The controller draws random numbers for run i with the seed `seed + i`.
+        wave.
         """
         controller = self.make(plant, runs, seed)
         if self.learns:

@@ -194,14 +194,8 @@ def run_program(program: str, work: Callable[[], str]) -> int:
 
     The exit status is 0 for success; 1 if tasks failed, the disk is full or the output pipe is
     closed; 130 after Ctrl-C; and 143 after SIGTERM. After a `UsageError`, or if a Python
-    package is missing, the process ends with the exit status 2.
-
-    Parameters
-    ----------
-    program
-        Command at the start of error messages, such as "python -m benchmarks.compare".
-    work
-        Function that does the work of the command and returns the last line to print, or "".
+    package is missing, the process ends with the exit status 2. Error messages begin with
+    `program`, such as "python -m benchmarks.compare".
     """
     try:
         last_line = work()

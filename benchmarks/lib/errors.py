@@ -27,16 +27,14 @@ EXTRAS = {
 class UsageError(ValueError):
     """A command cannot work with what a user typed, such as an unknown name in an option.
 
-    The message of a `UsageError` says what is invalid and why. A command that raises a
-    `UsageError` ends with exit status 2.
+    A command that raises a `UsageError` ends with exit status 2.
     """
 
 
 class UnfinishedError(RuntimeError):
     """A command could not do all of its work.
 
-    The message of an `UnfinishedError` says which work is missing. A command that raises an
-    `UnfinishedError` ends with exit status 1.
+    A command that raises an `UnfinishedError` ends with exit status 1.
     """
 
 
@@ -49,18 +47,11 @@ class NoBoundError(ValueError):
 
 
 def stop(program: str, error: UsageError | ImportError) -> NoReturn:
-    """Print the message of an error without a traceback, and exit with status 2.
+    """Print the message of `error` without a traceback, and exit with status 2.
 
-    If a package in `EXTRAS` is not installed, the message names the extra of this project that
-    installs the package. An ImportError for a package that is not in `EXTRAS` is a bug, and is
-    raised again.
-
-    Parameters
-    ----------
-    program
-        Command at the start of the message, such as "python -m benchmarks.compare".
-    error
-        Exception to report; `error.__cause__` may be an ImportError.
+    The printed message begins with the command `program`. If a package from an extra of this
+    project is not installed, the message names the extra. An ImportError for any other package
+    is a bug, and is raised again.
     """
     message = str(error)
     cause = error.__cause__ or error

@@ -36,8 +36,8 @@ class Outcome(NamedTuple):
 class FanOut:
     """The options `--jobs` and `--backend`: how many tasks run at once, and on which machines.
 
-    The two options do not change the result of a task whose random numbers all come from seeds
-    among the arguments of the task.
+    A task that draws all random numbers from seeds in its arguments has the same result with
+    all values of `--jobs` and `--backend`.
     """
 
     jobs: Count | None = None
@@ -56,7 +56,7 @@ class FanOut:
         Parameters
         ----------
         tasks
-            Functions without arguments, by the names of the tasks.
+            Tasks by name: functions without arguments.
         title
             Title of the progress bar.
         store
@@ -66,8 +66,7 @@ class FanOut:
         Raises
         ------
         UnfinishedError
-            If a task failed, after all other tasks have finished. The message lists the failed
-            tasks, each with an error.
+            If tasks failed. The error is raised after all other tasks have finished.
         """
         missing: dict[str, Task] = {}
         failures: list[Outcome] = []
@@ -158,8 +157,8 @@ def _summary(failures: Sequence[Outcome], tasks: int) -> str:
 def _prepare_worker(parent: int) -> None:
     """Make a worker process ignore Ctrl-C, and end soon after its parent process has ended.
 
-    A terminal sends Ctrl-C to the parent process as well, and the parent process ends the
-    worker processes. `parent` is the process identifier of the parent process.
+    After Ctrl-C, which a terminal sends to all processes, the parent process ends the worker
+    processes. `parent` is the process identifier of the parent process.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

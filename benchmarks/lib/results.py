@@ -1,4 +1,4 @@
-"""Keep the results of a command in a folder, also if the command is interrupted.
+"""Keep the results of a command in a folder, even if the command is interrupted.
 
 A command writes results for the folder `NAME` to the folder `NAME.unfinished`. When the command
 has finished, the folder `NAME.unfinished` replaces the folder `NAME`, so that old and new
@@ -33,8 +33,8 @@ WITHOUT_INFLUENCE = {"out", "fan_out"}  # fields of `Options` on which no result
 def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) -> Iterator[Path]:
     """Yield a folder for new results, which replaces `target` at the end of the `with` block.
 
-    The yielded folder is beside `target`, and has the same name with the ending `.unfinished`.
-    If the `with` block raises an error or is interrupted, the yielded folder is kept with the
+    The yielded folder for the `target` "results/x", for example, is "results/x.unfinished". If
+    the `with` block raises an error or is interrupted, the yielded folder is kept with the
     results in it, and the folder `target` does not change.
 
     Parameters
@@ -82,7 +82,7 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
 
 
 def _lock(final: Path) -> AbstractContextManager[object]:
-    """Lock the folder `final`, and return a context whose end unlocks the folder.
+    """Lock the folder `final`, and return a context manager that unlocks it at the end.
 
     The lock is a hidden file beside the folder `final`, which need not exist. If the process is
     killed, the operating system releases the lock.
@@ -126,10 +126,7 @@ def _record(folder: Path) -> dict[str, Any]:
 
 
 def _refuse_other_files(final: Path) -> None:
-    """Raise a `UsageError` if the folder `final` has files that no command wrote.
-
-    Thanks to this check, no command replaces a folder that contains a user's own files.
-    """
+    """Raise a `UsageError` if the folder `final` has files that no command wrote."""
     if final.exists() and not final.is_dir():
         raise UsageError(f"--out: {final} cannot be written to: it is not a folder")
     recorded = {RECORD_FILE, *_record(final).get("files", [])}
@@ -170,8 +167,8 @@ def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
 def _replace(final: Path, unfinished: Path) -> None:
     """Replace the folder `final` by the folder `unfinished` of a run that has finished.
 
-    Before, the names of all result files are added to `RECORD_FILE`, and the folder
-    `TASKS_FOLDER` is removed.
+    Before the replacement, the names of all result files are added to `RECORD_FILE`, and the
+    folder `TASKS_FOLDER` is removed.
     """
     _refuse_other_files(final)  # Somebody may have added files since the run began.
     shutil.rmtree(unfinished / TASKS_FOLDER, ignore_errors=True)
@@ -189,8 +186,8 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
     """Return everything that the results of a command depend on, as a dict for JSON.
 
     The dict has the name of the command, the options, a hash of the source code, and the
-    versions of Python and of packages. Two runs of a command with equal dicts have equal
-    results.
+    versions of Python and of packages. If the dicts of two runs are equal, the results of the
+    two runs are equal.
 
     Parameters
     ----------
@@ -232,9 +229,9 @@ def save_arrays(path: Path, result: Mapping[str, Any]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, Any]:
-    """Return the numbers and arrays that `save_arrays` has saved in the NPZ file `path`.
+    """Return the numbers and arrays, by name, that `save_arrays` has saved in the NPZ `path`.
 
-    The result is a dict with the names from `save_arrays`. NumPy raises a ValueError for an NPZ
+    NumPy raises a ValueError for an NPZ
     file with pickled objects, since loading pickled objects could run foreign code.
     """
     result = {}
@@ -249,7 +246,7 @@ def load_arrays(path: Path) -> dict[str, Any]:
 class KeptResults:
     """Files with the results of finished tasks, from which an interrupted run can continue.
 
-    When all tasks of a command have finished, `results_folder` removes the files.
+    `results_folder` removes the files with results of tasks when a command has finished.
 
     Attributes
     ----------

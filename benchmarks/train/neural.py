@@ -6,9 +6,9 @@ training differentiable predictive control (Drgona et al., "Differentiable predi
 deep learning alternative to explicit model predictive control for unknown nonlinear systems",
 Journal of Process Control 116, 2022, 80-92).
 
-To make the training fast, only the control law and the plant have gradients: the estimates of
-the plants' parameters are computed in NumPy, and count as constants. The loss is an expected
-error, in which a formula averages over later noise and later changes of the set point.
+The training is fast, because the estimates of the plants' parameters are computed in NumPy,
+without gradients, and because the loss is an expected control error: a formula averages over
+later noise and later changes of the set point.
 """
 
 import copy
@@ -155,9 +155,9 @@ class Loops:
         self._observations, _ = plants.reset(seed=seed, options=options)
 
     def run(self, samples: int) -> tuple[Tensor, Tensor]:
-        """Simulate the next `samples` samples of the episode, with gradients.
+        """Simulate the next `samples` samples of an episode, and return signals with gradients.
 
-        The gradients of the outputs end at the first of these samples.
+        Backpropagation from the outputs ends where this call of `run` began.
 
         Returns
         -------
@@ -187,7 +187,7 @@ class Loops:
 
 
 def noise_response(time_constant_factors: Tensor, samples: int) -> Tensor:
-    """Return the impulse response from the noise xi to the output of n plants.
+    """Return the impulse response from the noise xi to the output, shape (samples, n).
 
     The transfer function from xi to the output is C / A, with the polynomials A and C of
     equation (28) of the paper.
@@ -198,11 +198,6 @@ def noise_response(time_constant_factors: Tensor, samples: int) -> Tensor:
         Time constants of n plants, as multiples of the paper's time constant, shape (n,).
     samples
         Number of samples of the impulse response.
-
-    Returns
-    -------
-    Tensor
-        Impulse response of each plant, shape (samples, n).
     """
     pole = 1.0 - (1.0 - POLE) / time_constant_factors
     response: list[Tensor] = []

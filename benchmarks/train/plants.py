@@ -54,7 +54,7 @@ RANGES: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Batch:
-    """An episode of n random plants, and what the controllers know of the plants in advance."""
+    """Random plants for an episode, and what controllers know of the plants in advance."""
 
     numbers: dict[str, Tensor]
     """Parameter values of the plants, by the environment's arguments, each of shape (n,)."""
@@ -114,13 +114,13 @@ def environment(n: int) -> MiddlePointTorchEnv:
 class Sampler:
     """A generator of random training episodes, each with n plants.
 
-    The share `hard_share` of the plants is like the plants of the preset `hard`. For half of
-    the plants unlike `hard`, controllers know the exact result of a step test; for the other
-    half, a step test with errors. A set point of a plant unlike `hard` changes less often than
-    in `hard`, and mostly alternates between a positive and a negative value.
+    A share of the plants is like those of the preset `hard`. For half of the plants unlike
+    `hard`, controllers know the result of an exact step test, and for the other half the result
+    of a step test with errors. Set points of plants unlike `hard` change less often than in
+    `hard`, and mostly alternate between a positive and a negative value.
 
-    The order of the random draws must not change: with another order, the training with a seed
-    would no longer give the published network of this seed.
+    The code must draw random numbers in an unchanged order, so that a training gives the
+    published network with the same seed.
 
     Parameters
     ----------
@@ -189,11 +189,10 @@ class Sampler:
         return self._uniform(0.0, 1.0) < share
 
     def _plant_numbers(self, is_hard: Tensor) -> dict[str, Tensor]:
-        """Return random parameter values of the plants, by the environment's arguments.
+        """Return random parameter values of n plants, by argument name, each of shape (n,).
 
-        Each item of the result has the shape (n,). Plants like those of the preset `hard`
-        (`is_hard`, shape (n,)) have values from the ranges of `hard`, and all other plants from
-        wider ranges.
+        Plants like those of the preset `hard` (`is_hard`) have values from the ranges in
+        `hard`, and all other plants have values from wider ranges.
         """
         is_noisy = self._true_for(0.65)
         has_load = self._true_for(0.5)
@@ -226,22 +225,21 @@ class Sampler:
         return numbers
 
     def _amplitudes(self, gain_factors: Tensor, is_hard: Tensor) -> Tensor:
-        """Return the largest set point of each plant, drawn at random, degC, shape (n,).
+        """Return a random amplitude of the set points of each plant, degC, shape (n,).
 
-        For a plant unlike the preset `hard`, the flow limits allow the largest set point.
-        `gain_factors` are the gains as multiples of the paper's gain, shape (n,). `is_hard`,
-        shape (n,), says which plants are like those of the preset `hard`.
+        Plants like those of the preset `hard` (`is_hard`) have the amplitude of the paper. For
+        all other plants, the amplitude is within the temperature range of the plant, which is
+        in proportion to `gain_factors`, the gains as multiples of the paper's gain.
         """
         reachable = 0.95 * GAIN * HALF_RANGE * gain_factors
         amplitudes = torch.where(self._true_for(0.5), 5.0, self._uniform(1.0, 6.0))
         return torch.where(is_hard, PAPER.setpoint_amplitude, amplitudes.minimum(reachable))
 
     def _setpoints(self, amplitudes: Tensor, is_hard: Tensor) -> tuple[Tensor, Tensor]:
-        """Return random set points, degC, and the numbers of samples since the last change.
+        """Return random set points, degC, and the number of samples since the last change.
 
-        Both results have the shape (SAMPLES + 1, n). `amplitudes` are the largest set points,
-        degC, shape (n,). `is_hard`, shape (n,), says which plants are like those of the preset
-        `hard`.
+        Both results have the shape (SAMPLES + 1, n). `amplitudes` are the largest set points of
+        the plants, degC, shape (n,).
         """
         shortest_hard, longest_hard = HOLD_TIMES
         shortest_other = self._uniform(longest_hard + 10.0, 700.0)
@@ -273,10 +271,10 @@ class Sampler:
         """Return the gains or the time constants that step tests of n plants find, shape (n,).
 
         The results, and the true values `factors`, are multiples of the paper's gain or time
-        constant. For a plant like those of the preset `hard` (`is_hard`), the step test finds
-        the middle of the range in `hard`. For a plant unlike `hard`, the step test finds the
-        true value (`is_exact`) or a value with an error. `spread` is the standard deviation of
-        the logarithm of a found value divided by the true value.
+        constant. For a plant like those of the preset `hard` (`is_hard`), a step test finds the
+        middle of the range in `hard`. For a plant unlike `hard`, a step test finds the true
+        value (`is_exact`) or a value with a random error. The logarithm of the found value
+        divided by the true value has the standard deviation `spread`.
         """
         middle = sum(HARD["gain_factor"]) / 2.0  # for the time constant, the range is equal
         normal = torch.randn(self._n, generator=self._generator).clamp(-2.0, 2.0)
@@ -288,14 +286,11 @@ class Sampler:
     ) -> Prior:
         """Return the candidate models of each plant, and the models' initial probabilities.
 
-        Each plant has a candidate model for every pair of one of `DELAYS` delays and one of
-        `TIME_CONSTANTS`. For a plant with an exact step test (`is_exact`, shape (n,)), the
-        model from the step test has the probability 1. For half of the plants unlike the preset
-        `hard` (`is_hard`, shape (n,)), models with a wrong delay are less probable.
-
-        `time_constant_factors` are the time constants that step tests have found, as multiples
-        of the paper's time constant, shape (n,). `delays` are the true delays, samples, shape
-        (n,).
+        Each plant has one candidate model for each pair of a delay and a time constant. For a
+        plant with an exact step test (`is_exact`), the candidate model from the step test has
+        the probability 1. For half of the plants unlike the preset `hard` (`is_hard`), models
+        with a wrong delay are less probable. `time_constant_factors` are the time
+        constants from step tests, as multiples of the paper's time constant, shape (n,).
         """
         poles = 1.0 - (1.0 - POLE) / time_constant_factors
         time_constants = -1.0 / torch.log(poles)  # samples
@@ -324,11 +319,11 @@ class Sampler:
     def _widest_dead_zones(
         self, dead_zones: Tensor, is_hard: Tensor, is_exact: Tensor
     ) -> Tensor:
-        """Return the greatest half width of the dead zone that controllers expect, t/h.
+        """Return the half width of the dead zone that controllers assume for each plant, t/h.
 
-        With an exact step test (`is_exact`), controllers expect the true half widths
-        `dead_zones`. For plants like those of the preset `hard` (`is_hard`), controllers expect
-        the greatest half width in `hard`.
+        After an exact step test (`is_exact`), controllers assume the true half width. For
+        plants like those of the preset `hard` (`is_hard`), controllers assume the greatest half
+        width in `hard`. For all other plants, the half width is up to 3 t/h too large.
         """
         margins = self._uniform(0.0, 3.0) * ~is_exact
         widest = (dead_zones + margins).clamp(max=8.0)

@@ -222,8 +222,8 @@ class Plants(GymnasiumVecEnv):
     """The training plants of a recipe, as a vector environment of Stable-Baselines3.
 
     Each group of `GROUP` successive plants has one seed, so all plants of the group have the
-    same parameter values, noise and set points. An observation of `Plants` is shorter than that
-    of `MiddlePoint-v0`: the inputs of the policy, computed with the matrix from `features`.
+    same parameter values, noise and set points. The observations are the inputs of the policy:
+    the matrix from `features`, multiplied by the observations of `MiddlePoint-v0`.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ class Plants(GymnasiumVecEnv):
         return super().seed(TRAINING_SEEDS + offset)
 
     def reset(self) -> NDArray[Any]:
-        """Reset all plants, and return their observations, shape (plants, inputs)."""
+        """Reset all plants, and return the policy's inputs, shape (plants, inputs)."""
         return super().reset() @ self._features
 
     def step_wait(self) -> VecEnvStepReturn:
