@@ -35,8 +35,8 @@ class Case(NamedTuple):
 class Options:
     """Compare the steps a second of the environments with those of Gymnasium's CartPole.
 
-    In each round, all environments are timed once. The ratio to CartPole compares the steps a
-    second of the same round.
+    In each round, all environments are timed once. The printed ratio is the median, over all
+    rounds, of the ratio to CartPole in the same round.
     """
 
     rounds: Runs = 15
@@ -46,7 +46,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Measure speeds, print a table for each number of plants, and return the last line."""
+    """Measure speeds, print tables, and return the last line to print."""
     from benchmarks.lib.report import on_screen
 
     numbers_of_plants = ON_DEVICE if options.device else BATCHES

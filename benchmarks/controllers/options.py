@@ -72,16 +72,16 @@ def chosen(
 ) -> dict[str, ControllerSpec]:
     """Return a `ControllerSpec` for each controller that a user has chosen, by name.
 
-    The code in a user's module or zip file is not loaded before a call of the method `members`
-    of the returned `ControllerSpec`.
+    The method `members` of a returned `ControllerSpec` loads the code in the user's module or
+    zip file.
 
     Parameters
     ----------
     names
         Values of the option `--agents`: names of controllers in `ROSTER`.
     user_controllers
-        Values of the option `--agent`, each in the form NAME=LOCATION. Locations with the same
-        NAME become the members of one controller.
+        Values of the option `--agent`, each in the form NAME=LOCATION. Several values with the
+        same NAME are several trainings of one controller.
 
     Raises
     ------
@@ -136,8 +136,7 @@ def _name_and_location(word: str) -> tuple[str, str]:
 def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
     """Return the `ControllerSpec` of a user's own controller called `name`.
 
-    The controller has one member for each element of `locations`, a text LOCATION in the option
-    `--agent NAME=LOCATION`.
+    Each element of `locations` is the text LOCATION of an option `--agent NAME=LOCATION`.
 
     Raises
     ------
@@ -150,7 +149,7 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
     if len(locations) > 1 and has_file and suffixes != {".npz"}:
         listed = " and ".join(locations)
         raise UsageError(
-            f"--agent: {name!r} must be one gains.json or several .npz, got {listed}"
+            f"--agent: {name!r} must be one gains.json or several .npz files, got {listed}"
         )
     try:
         if suffixes == {".json"}:
@@ -189,7 +188,7 @@ def _with_searched_gains(name: str, file: Path) -> ControllerSpec:
 def _with_trained_networks(name: str, files: Sequence[str]) -> ControllerSpec:
     """Return the `ControllerSpec` of a controller with policies from NPZ files.
 
-    Each of `files` contains one policy that `python -m benchmarks.train ppo` has trained.
+    Each NPZ file in `files` contains one policy that `benchmarks.train ppo` has trained.
     """
     networks = {file: PolicyNetwork.load(Path(file)) for file in files}
     provenance = networks[files[0]].provenance

@@ -44,13 +44,13 @@ class OwnController(ControllerSpec):
     Attributes
     ----------
     locations : sequence of str
-        Location of each member's factory, in the form MODULE:FACTORY or ALGORITHM:FILE.zip.
+        Locations of the user's factories, in the form MODULE:FACTORY or ALGORITHM:FILE.zip.
     """
 
     locations: Sequence[str]
 
     def members(self) -> list[ControllerSpec]:
-        """Load all factories, and return a `ControllerSpec` for each, sorted by location.
+        """Load the user's factories, and return a `ControllerSpec` for each factory.
 
         A `UsageError` is raised if a user's factory cannot be loaded.
         """
@@ -155,8 +155,8 @@ def load_factory(location: str) -> Factory:
 def _factory_of_zip(location: str) -> Factory:
     """Return a factory that returns the Stable-Baselines3 model at ALGORITHM:FILE.zip.
 
-    A file that `mptc_gym.sb3.save` wrote describes the environment that the model acts in. A
-    model from any other file acts in `MiddlePoint-v0` without wrappers.
+    A file that `mptc_gym.sb3.save` wrote describes the environment that the model acts in. If
+    another function wrote the file, the model acts in `MiddlePoint-v0` without wrappers.
     """
     import stable_baselines3  # imported here, as PyTorch takes seconds to load
 
@@ -200,7 +200,8 @@ def observation_of(factory: Factory) -> Mapping[str, int]:
     if not isinstance(observation, Mapping) or not set(observation) <= set(WINDOWS):
         allowed = ", ".join(WINDOWS)
         raise ValueError(
-            f"observation must be a dict with keys from {allowed}, got {observation!r}"
+            f"the attribute observation must be a dict with keys from {allowed}, "
+            f"got {observation!r}"
         )
     return observation
 
@@ -208,7 +209,7 @@ def observation_of(factory: Factory) -> Mapping[str, int]:
 def make_controller(*, factory: Factory, **prior_knowledge: Any) -> Agent:
     """Call a user's factory, and return the controller that the factory makes.
 
-    `prior_knowledge` has the quantities of the plant that the controller may know, by name. The
+    `prior_knowledge` has the quantities of the plant that the controller may know, by name. A
     factory gets the quantities that are named in its signature, or all quantities if the
     signature has `**kwargs`. A ValueError is raised if the factory needs an argument that is
     not in `prior_knowledge`.

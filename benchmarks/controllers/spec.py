@@ -32,7 +32,7 @@ EVERYTHING = "parameters", "num_envs", "seed"
 def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
     """Return what a controller may know about a plant, as a dict of quantities by name.
 
-    The items of the dict are keyword arguments for the constructor of the controller.
+    The returned dict has keyword arguments for the constructor of a controller.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class ControllerSpec:
         Function that returns the controller's trained networks by file name. A member of the
         controller is the controller with one of the networks; commands run all members.
     networks_are_alike : bool
-        Whether the trained networks hardly differ, so that most comparisons run only one.
+        Whether the networks hardly differ, so that most comparisons run only one network.
     random : bool
         Whether the controller draws random numbers, such as initial weights.
     learns : bool
@@ -217,7 +217,7 @@ class ControllerSpec:
         return replace(self, networks=first_network)
 
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
-        """Return a `ControllerSpec` with fixed values `gains` of arguments of `build`.
+        """Return a copy in which arguments of `build`, by name, have the fixed values `gains`.
 
         If `gains` has a value for the argument `tuned_by`, `robust_time_constant` no longer
         chooses that value.
@@ -263,7 +263,7 @@ class ControllerSpec:
         return LinearLoop.of(controller, nominal(Parameters(**plant)))
 
     def misfit(self, plant: Parameters) -> str:
-        """Return a sentence that says why the controller does not fit `plant`, or "".
+        """Return why the controller does not fit `plant`, as a sentence; "" if it fits.
 
         The controller fits if `plant` agrees with the plant `made_for` in all properties of
         `assumes`.
@@ -313,7 +313,7 @@ class ControllerSpec:
         return rollout(plants, agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller for `runs` runs that has learnt on `plant`, if it can learn.
+        """Return a controller for `runs` runs, trained on `plant` if the controller learns.
 
         A controller that learns is first run on `plant` for `LEARNING` samples of the square
         wave.

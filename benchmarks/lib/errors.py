@@ -25,7 +25,7 @@ EXTRAS = {
 
 
 class UsageError(ValueError):
-    """A command cannot work with what a user typed, such as an unknown name in an option.
+    """A command cannot run as the user typed it, for example because a name is unknown.
 
     A command that raises a `UsageError` ends with exit status 2.
     """

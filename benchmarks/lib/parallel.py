@@ -196,7 +196,7 @@ def _connect_to_ray() -> None:
     Raises
     ------
     UsageError
-        If no cluster can be reached.
+        If no Ray cluster can be reached.
     """
     import ray  # imported here, as it is optional and slow to import
     from ray.util.joblib import register_ray

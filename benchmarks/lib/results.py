@@ -246,7 +246,7 @@ def load_arrays(path: Path) -> dict[str, Any]:
 class KeptResults:
     """Files with the results of finished tasks, from which an interrupted run can continue.
 
-    `results_folder` removes the files with results of tasks when a command has finished.
+    When a command has finished, the function `results_folder` removes these files.
 
     Attributes
     ----------

@@ -137,7 +137,7 @@ class Loops:
     net
         Network that corrects the control law.
     seed
-        Seed of the environment, for random numbers that are not in `batch`.
+        Seed of all random numbers that are not in `batch`, such as the measurement noise.
     """
 
     def __init__(self, plants: MiddlePointTorchEnv, batch: Batch, net: Net, seed: int) -> None:
@@ -187,7 +187,7 @@ class Loops:
 
 
 def noise_response(time_constant_factors: Tensor, samples: int) -> Tensor:
-    """Return the impulse response from the noise xi to the output, shape (samples, n).
+    """Return the impulse response from the white noise xi to the output, shape (samples, n).
 
     The transfer function from xi to the output is C / A, with the polynomials A and C of
     equation (28) of the paper.
@@ -248,8 +248,8 @@ def filtered(innovations: Tensor, responses: Tensor) -> Tensor:
     Parameters
     ----------
     innovations
-        White noise of n plants, shape (samples + lags - 1, n). The first lags - 1 rows are the
-        noise before the first sample of the result.
+        White noise of n plants, shape (samples + lags - 1, n). The first lags - 1 rows are from
+        the samples before the first row of the result.
     responses
         Impulse response for each plant, shape (lags, n).
     """
@@ -354,7 +354,7 @@ def train(training: Training, seed: int) -> RecurrentNetwork:
 
 
 def optimise(training: Training, net: Net, seed: int) -> Net:
-    """Train `net` in place, and return a network with the running mean of the weights.
+    """Train `net` in place, and return a network with the running mean of `net`'s weights.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ class Batch:
 
     @property
     def signals(self) -> dict[str, Tensor]:
-        """Parameter values, set points and noise, as the option "signals" of `reset`.
+        """Parameter values, set points and noise, for `reset(options={"signals": ...})`.
 
         The noise, degC, is C xi, with the white noise xi and the polynomial C of equation (28)
         of the paper.
@@ -270,11 +270,11 @@ class Sampler:
     ) -> Tensor:
         """Return the gains or the time constants that step tests of n plants find, shape (n,).
 
-        The results, and the true values `factors`, are multiples of the paper's gain or time
-        constant. For a plant like those of the preset `hard` (`is_hard`), a step test finds the
-        middle of the range in `hard`. For a plant unlike `hard`, a step test finds the true
-        value (`is_exact`) or a value with a random error. The logarithm of the found value
-        divided by the true value has the standard deviation `spread`.
+        The true values `factors`, and the found values, are multiples of the paper's gain or
+        time constant. For a plant like those of the preset `hard` (`is_hard`), a step test
+        finds the middle of the range in `hard`. For a plant unlike `hard`, a step test finds
+        the true value (`is_exact`) or a value with a random error. The logarithm of the found
+        value divided by the true value has the standard deviation `spread`.
         """
         middle = sum(HARD["gain_factor"]) / 2.0  # for the time constant, the range is equal
         normal = torch.randn(self._n, generator=self._generator).clamp(-2.0, 2.0)

@@ -209,7 +209,7 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
 
 
 def begin(recipe: Recipe, seed: int) -> PPO:
-    """Return an untrained model of Stable-Baselines3 for a recipe.
+    """Return an untrained PPO model of Stable-Baselines3 with the settings in `recipe`.
 
     `seed` is the seed of the initial weights, the exploration and the plants.
     """
@@ -219,7 +219,7 @@ def begin(recipe: Recipe, seed: int) -> PPO:
 
 
 class Plants(GymnasiumVecEnv):
-    """The training plants of a recipe, as a vector environment of Stable-Baselines3.
+    """The training plants of `recipe`, as a vector environment of Stable-Baselines3.
 
     Each group of `GROUP` successive plants has one seed, so all plants of the group have the
     same parameter values, noise and set points. The observations are the inputs of the policy:
