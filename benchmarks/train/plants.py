@@ -27,7 +27,7 @@ HARD: Final = PRESETS["hard"]  # arguments of the environment `MiddlePointHard-v
 HOLD_TIMES: Final = (100, 300)
 # A hold time that never ends, samples, for set points that do not change at random.
 UNCHANGED: Final = 1e30
-DELAYS: Final = 13  # number of delays in the bank of models of each plant
+DELAYS: Final = 13  # number of delays among the candidate models of each plant
 # Standard deviation of the logarithm of the time constant from an inexact step test.
 TIME_CONSTANT_SPREAD: Final = 0.35
 EXACT_GAIN_SPREAD: Final = 1e-3  # like `GAIN_SPREAD`, for the gain from an exact step test
