@@ -15,7 +15,7 @@ def questions() -> str:
     The questions and commands come from the table in `benchmarks/README.md`.
     """
     page = FOLDER.joinpath("README.md").read_text(encoding="utf-8")
-    # A row begins "| [QUESTION](PAGE) | `COMMAND`", or without the link to a page.
+    # A row begins with "| [QUESTION](PAGE) | `COMMAND`" or "| QUESTION | `COMMAND`".
     rows = re.findall(r"^\| \[?(.+?)(?:\]\(\S+\))? \| `(python .+?)`", page, re.MULTILINE)
     lines = [f"{question}\n    {command}" for question, command in rows]
     lines.append("\nEach command has --help.")

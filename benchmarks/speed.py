@@ -1,4 +1,4 @@
-"""Compare steps a second with those of Gymnasium's CartPole: `python -m benchmarks.speed`."""
+"""Compare the speed of the environments with that of CartPole: `python -m benchmarks.speed`."""
 
 import importlib.util
 import time
@@ -18,24 +18,25 @@ BATCHES = (1, 8, 64, 1024, 16384)  # numbers of plants that are stepped together
 # Numbers of plants with the option --device: 1,024 to 4,194,304.
 ON_DEVICE = tuple(4**power for power in range(5, 12))
 REFERENCE, PLANT = "CartPole-v1", "MiddlePoint-v0"
-# Arguments of the environment for the measured plants. The keys are the ends of the plants'
-# names in the table.
+# Arguments of the environment for the measured plants. Each key is the end of a plant's name in
+# the table.
 PLANTS: dict[str, Any] = {"": {}, ", R = 0.5": PRESETS["noisy"], ", hard": PRESETS["hard"]}
 
 
 class Case(NamedTuple):
-    """A function to time, and the number of steps that the function makes."""
+    """A function that steps an environment, and the number of steps in a call."""
 
     run: Callable[[], object]  # the function
-    steps: int  # steps in a call of the function, summed over all plants
+    steps: int  # summed over all plants
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Compare the steps a second of the environments with those of CartPole.
+    """Compare the steps a second of the environments with those of Gymnasium's CartPole.
 
-    Each round times every case of a table once. A ratio compares two cases of the same round.
+    In each round, all environments are timed once. The printed ratio is the median, over all
+    rounds, of the ratio to CartPole in the same round.
     """
 
     rounds: Runs = 15
@@ -45,7 +46,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Measure speeds, print a table for each number of plants, and return the closing line."""
+    """Measure speeds, print tables, and return the last line to print."""
     from benchmarks.lib.report import on_screen
 
     numbers_of_plants = ON_DEVICE if options.device else BATCHES
@@ -62,8 +63,8 @@ def make_environments(n: int, device: str | None) -> dict[str, Any]:
     """Return the environments to measure, each with n plants, by their names in the table.
 
     If `device` is None, the environments are CartPole, the plants in NumPy and, if PyTorch is
-    installed and n is above 1, the plants in PyTorch on the CPU. Otherwise, the environments
-    are the plants in PyTorch on the device with this name, such as "cuda".
+    installed and n is above 1, the plants in PyTorch on the CPU. If `device` is the name of a
+    device, such as "cuda", the environments are the plants in PyTorch on this device.
     """
     if n == 1:
         return {name: gymnasium.make(name) for name in (REFERENCE, PLANT)}
@@ -86,16 +87,16 @@ def make_environments(n: int, device: str | None) -> dict[str, Any]:
 
 
 def stepping(env: Any) -> Case:
-    """Return a case that steps an environment with random actions.
+    """Return a `Case` that steps an environment with random actions.
 
-    A vector environment is stepped for one episode of the plant, and resets itself. A single
-    environment is stepped for the length of ten episodes of the plant, and is reset at the end
-    of each of its own episodes.
+    A vector environment, which resets itself, makes `EPISODE` + 1 steps. A single environment
+    makes 10 `EPISODE` steps, and is reset when an episode has ended.
 
     Parameters
     ----------
     env
-        A Gymnasium environment, a Gymnasium vector environment, or a `MiddlePointTorchEnv`.
+        Environment to step: a Gymnasium environment, a Gymnasium vector environment, or a
+        `MiddlePointTorchEnv`.
     """
     is_single = isinstance(env, gymnasium.Env)
     if is_single:
@@ -109,35 +110,35 @@ def stepping(env: Any) -> Case:
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(distinct_actions)]
-    device = getattr(env, "device", None)  # that of the PyTorch environment
+    device = getattr(env, "device", None)  # None if the environment uses NumPy
     if device is not None:
         import torch
 
         actions = [torch.as_tensor(action, device=device) for action in actions]
 
     def run() -> None:
-        """Make all steps of the case."""
+        """Step the environment `steps` times."""
         for k in range(steps):
             _, _, terminated, truncated, _ = env.step(actions[k % distinct_actions])
             if is_single and (terminated or truncated):
                 env.reset()
         if device is not None and device.type != "cpu":
-            torch.accelerator.synchronize()  # A device may not have finished all steps yet.
+            torch.accelerator.synchronize()  # A GPU may not have finished all steps yet.
 
-    env.step(actions[0])  # The first step is slow on a device.
+    env.step(actions[0])  # The first step on a GPU is slow.
     return Case(run, steps * plants)
 
 
 def compare(cases: Mapping[str, Case], rounds: int) -> Any:
-    """Time cases for some rounds, and return a data frame of text with a row for each case.
+    """Measure the speed of each case in `rounds` rounds, and return a DataFrame of text.
 
-    In a round, each case is timed once. A row has the median over rounds of the steps per
-    second, and the ratio to the first case: the median of the quotients of the steps per second
-    in the same round, with the 10th and the 90th percentile in parentheses.
+    Each case is timed once in each round. A row of the DataFrame has the name of a case, the
+    median of the steps per second, and the ratio to the first case. The ratio is the median,
+    with the 10th and the 90th percentile in parentheses, of the ratios in the same round.
     """
-    import pandas as pd  # imported here, as in all commands: it would slow the help down
+    import pandas as pd  # imported here, as pandas would slow `--help` down
 
-    seconds = []  # of each round, a list with the duration of each case
+    seconds = []  # for each round, an array with the duration of each case, s
     for _ in range(rounds):
         times = [time.perf_counter()]
         for case in cases.values():

@@ -155,7 +155,7 @@ class TestOwnControllers:
             ),
             (
                 "from mptc_gym import MiddlePointEnv as E\ndef Mine(): return (lambda o: o), E",
-                "must have the parameters of the case",
+                "must have the case's plant and set point",
             ),
         ],
     )

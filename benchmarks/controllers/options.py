@@ -1,6 +1,7 @@
-"""Read the options that choose controllers, `--agents` and `--agent`.
+"""Read the command-line options `--agents` and `--agent`, which choose controllers.
 
-`--agents` names controllers of this project, and `--agent` names a user's own controller.
+The option `--agents` chooses controllers of this project, and the option `--agent` adds a
+user's own controller.
 """
 
 import importlib.util
@@ -34,7 +35,7 @@ MODULE_NAME = re.compile(r"\w+(\.(?!py$)\w+)*")
 @options
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
-    """The options that choose a user's own controllers, and where controllers run."""
+    """The options `--agent` for a user's own controllers, `--jobs` and `--backend`."""
 
     agent: Names = ()
     """A controller of your own, which runs in addition to those of --agents. Its form is
@@ -45,20 +46,20 @@ class ControllerOptions:
 
 
 def agent_names(option: str, names: Sequence[str]) -> list[str]:
-    """Return the names of controllers that a user has listed in an option, each once.
+    """Return the controller names that a user typed after an option, each once.
 
     Parameters
     ----------
     option
-        The name of the option, such as "--agents", for the error message.
+        Name of the command-line option for the error message, such as "--agents".
     names
-        The listed names.
+        Names that the user typed.
 
     Raises
     ------
     UsageError
-        If no controller in `ROSTER` has one of the names. For a name of an earlier version, the
-        message has the present name.
+        If an element of `names` is not the name of a controller in `ROSTER`. The message for a
+        renamed controller has the new name of the controller.
     """
     for name in names:
         if name in RENAMED:
@@ -69,22 +70,24 @@ def agent_names(option: str, names: Sequence[str]) -> list[str]:
 def chosen(
     names: Sequence[str], user_controllers: Sequence[str] = ()
 ) -> dict[str, ControllerSpec]:
-    """Return the records of the controllers that a user has chosen, by name.
+    """Return a `ControllerSpec` for each controller that a user has chosen, by name.
+
+    The method `members` of a returned `ControllerSpec` loads the code in the user's module or
+    zip file.
 
     Parameters
     ----------
     names
-        Names of controllers in `ROSTER`: the words of the option `--agents`.
+        Values of the option `--agents`: names of controllers in `ROSTER`.
     user_controllers
-        A user's own controllers: the words of the option `--agent`, each in the form
-        NAME=LOCATION. Several locations with one name become the members of one controller.
+        Values of the option `--agent`, each in the form NAME=LOCATION. Several values with the
+        same NAME are several trainings of one controller.
 
     Raises
     ------
     UsageError
-        If no controller is chosen, a name is unknown or taken, or a location does not exist.
-        The code of a user's module or zip file is loaded later, by the method `members` of the
-        record.
+        If no controller is chosen, if a controller's name is unknown or taken, or if the
+        location of a user's controller does not exist.
     """
     if not (names or user_controllers):
         raise UsageError("--agents, --agent: name at least one controller")
@@ -99,13 +102,13 @@ def chosen(
 
 
 def _name_and_location(word: str) -> tuple[str, str]:
-    """Return NAME and LOCATION of a value NAME=LOCATION of the option `--agent`.
+    """Split a value NAME=LOCATION of the option `--agent` into NAME and LOCATION.
 
     Raises
     ------
     UsageError
-        If `word` has another form, if a controller in `ROSTER` has this name, or if the file or
-        the module of the location does not exist.
+        If `word` does not have the form NAME=LOCATION, if a controller in `ROSTER` is called
+        NAME, or if the file or the module in LOCATION does not exist.
     """
     name, _, location = word.partition("=")
     module, _, factory = location.partition(":")
@@ -131,22 +134,22 @@ def _name_and_location(word: str) -> tuple[str, str]:
 
 
 def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
-    """Return the record of a user's own controller called `name`.
+    """Return the `ControllerSpec` of a user's own controller called `name`.
 
-    The controller has one member for each location: LOCATION in NAME=LOCATION, the value of the
-    option `--agent`.
+    Each element of `locations` is the text LOCATION of an option `--agent NAME=LOCATION`.
 
     Raises
     ------
     UsageError
-        If a JSON or NPZ file cannot be read, or if the kinds of locations cannot be combined.
+        If a JSON or NPZ file in `locations` cannot be read, if a JSON file is combined with
+        another location, or if an NPZ file is combined with a location of another type.
     """
     suffixes = {Path(location).suffix for location in locations}
     has_file = ".json" in suffixes or ".npz" in suffixes
     if len(locations) > 1 and has_file and suffixes != {".npz"}:
         listed = " and ".join(locations)
         raise UsageError(
-            f"--agent: {name!r} must be one gains.json or several .npz, got {listed}"
+            f"--agent: {name!r} must be one gains.json or several .npz files, got {listed}"
         )
     try:
         if suffixes == {".json"}:
@@ -170,10 +173,7 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
 
 
 def _with_searched_gains(name: str, file: Path) -> ControllerSpec:
-    """Return the record of a controller with the gains in a file of `benchmarks.tune`.
-
-    `name` is the user's name for the controller, and `file` is the JSON file.
-    """
+    """Return the `ControllerSpec` of a controller with gains from a `benchmarks.tune` file."""
     content = json.loads(file.read_text(encoding="utf-8"))
     return replace(
         ROSTER[content["controller"]].with_gains(content["gains"]),
@@ -186,10 +186,9 @@ def _with_searched_gains(name: str, file: Path) -> ControllerSpec:
 
 
 def _with_trained_networks(name: str, files: Sequence[str]) -> ControllerSpec:
-    """Return the record of a controller with the policies in files of `benchmarks.train ppo`.
+    """Return the `ControllerSpec` of a controller with policies from NPZ files.
 
-    `name` is the user's name for the controller, and `files` are NPZ files with one policy
-    each.
+    Each NPZ file in `files` contains one policy that `benchmarks.train ppo` has trained.
     """
     networks = {file: PolicyNetwork.load(Path(file)) for file in files}
     provenance = networks[files[0]].provenance

@@ -1,9 +1,9 @@
 """Load and run a user's own controllers.
 
-A factory is a function or a class of the user that returns a policy; a zip file of
-Stable-Baselines3 is wrapped in a factory. `benchmarks/compare/README.md` describes what a
-factory gets and returns. The code of a user is loaded in the task that runs the controller, so
-that an error in the code does not stop other tasks.
+A *factory* is a user's function or class that returns a policy. The page
+`benchmarks/compare/README.md` describes the arguments and the result of a factory. A user's
+code is loaded in the task that runs the controller, so that an error in the code does not stop
+other tasks.
 """
 
 import importlib
@@ -32,27 +32,27 @@ from mptc_gym.scoring.opening import opened
 from mptc_gym.scoring.policies import start
 
 Factory = Callable[..., Any]
-# Attributes of a factory with texts for the report: the prior knowledge, the training, and a
-# remark.
+# Optional attributes of a factory, texts for the report: the prior knowledge of the controller,
+# the training of the controller, and a remark.
 TEXTS = "knows", "searched", "note"
 
 
 @dataclass(frozen=True, kw_only=True)
 class OwnController(ControllerSpec):
-    """The record of a user's own controller, whose errors become sentences.
+    """A user's own controller, whose exceptions are reported as a `UsageError`.
 
     Attributes
     ----------
     locations : sequence of str
-        Where the factory of each member is: texts MODULE:FACTORY or ALGORITHM:FILE.zip.
+        Locations of the user's factories, in the form MODULE:FACTORY or ALGORITHM:FILE.zip.
     """
 
     locations: Sequence[str]
 
     def members(self) -> list[ControllerSpec]:
-        """Load the factories, and return a record for each factory, in the order of locations.
+        """Load the user's factories, and return a `ControllerSpec` for each factory.
 
-        A `UsageError` is raised if a factory cannot be loaded.
+        A `UsageError` is raised if a user's factory cannot be loaded.
         """
         members: list[ControllerSpec] = []
         for location in sorted(set(self.locations)):
@@ -75,9 +75,9 @@ class OwnController(ControllerSpec):
         return members
 
     def make(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller for a batch of runs, as `ControllerSpec.make` does.
+        """Return a controller for a batch of `runs` runs, as `ControllerSpec.make` does.
 
-        A `UsageError` is raised if the factory cannot be called or raises an error.
+        A `UsageError` is raised if the user's factory cannot be called or raises an error.
         """
         with blame_user(f"{self.name}={self.locations[0]}", "made"):
             return super().make(plant, runs, seed)
@@ -92,8 +92,8 @@ class OwnController(ControllerSpec):
     ) -> Trajectory:
         """Run the controller on a batch of plants, as `ControllerSpec.run` does.
 
-        A `UsageError` is raised if the controller raises an error, returns invalid actions, or
-        does not fit the plants.
+        A `UsageError` is raised if the user's controller raises an error, returns invalid
+        actions, or does not fit the plants.
         """
         agent = controller or self.make(plant, runs, seed)
         with blame_user(f"{self.name}={self.locations[0]}", "run"):
@@ -105,17 +105,18 @@ class OwnController(ControllerSpec):
 
 @contextmanager
 def blame_user(controller: str, step: str) -> Iterator[None]:
-    """Turn an error in the block of a `with` statement into a `UsageError`.
+    """Turn an exception in the block of a `with` statement into a `UsageError`.
 
-    The message names the user's controller and ends with a traceback, except if a check of this
-    project has raised a ValueError, for example for an action that is not finite.
+    The message of the `UsageError` names the user's controller and ends with a traceback. The
+    traceback is left out if code of this project has raised a ValueError, for example because
+    an action is not finite.
 
     Parameters
     ----------
     controller
-        The value of the option `--agent`, NAME=LOCATION.
+        Value of the option `--agent`, in the form NAME=LOCATION.
     step
-        What the block does with the controller: "loaded", "made" or "run".
+        What failed, for the message: "loaded", "made" or "run".
     """
     try:
         yield
@@ -131,12 +132,12 @@ def blame_user(controller: str, step: str) -> Iterator[None]:
 
 
 def load_factory(location: str) -> Factory:
-    """Return the factory at the location MODULE:FACTORY or ALGORITHM:FILE.zip.
+    """Return the user's factory at the location MODULE:FACTORY or ALGORITHM:FILE.zip.
 
     Raises
     ------
     ValueError
-        If the module has no such factory, or if the factory cannot be called.
+        If the module MODULE has no attribute FACTORY, or if FACTORY is not callable.
     """
     if location.endswith(".zip"):
         return _factory_of_zip(location)
@@ -152,10 +153,10 @@ def load_factory(location: str) -> Factory:
 
 
 def _factory_of_zip(location: str) -> Factory:
-    """Return a factory of the model of Stable-Baselines3 at ALGORITHM:FILE.zip.
+    """Return a factory that returns the Stable-Baselines3 model at ALGORITHM:FILE.zip.
 
-    If `mptc_gym.sb3.save` wrote the file, the file describes the environment that the model
-    acts in. Otherwise, the model acts in `MiddlePoint-v0` without wrappers.
+    A file that `mptc_gym.sb3.save` wrote describes the environment that the model acts in. If
+    another function wrote the file, the model acts in `MiddlePoint-v0` without wrappers.
     """
     import stable_baselines3  # imported here, as PyTorch takes seconds to load
 
@@ -174,7 +175,7 @@ def _factory_of_zip(location: str) -> Factory:
     def factory() -> Any:
         return model
 
-    # Texts for the report, as a user's factory can have them.
+    # Some of the attributes in `TEXTS`, which the report prints.
     weights = sum(weight.numel() for weight in model.policy.parameters())
     samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
     factory.searched = f"{weights:,} weights: {samples}"  # type: ignore[attr-defined]
@@ -186,19 +187,21 @@ def _factory_of_zip(location: str) -> Factory:
 def observation_of(factory: Factory) -> Mapping[str, int]:
     """Return how many samples of each signal the policies of a factory observe.
 
-    The keys are arguments of the environment, such as "error_window". The default of the
-    factory's attribute `observation` is the observation of the paper.
+    The keys of the result are arguments of the environment, such as "error_window". If the
+    factory has no attribute `observation`, the policies get the observation of the paper.
 
     Raises
     ------
     ValueError
-        If `observation` is not a dict of such arguments.
+        If the attribute `observation` of the factory is not a dict, or if a key of the dict is
+        not in `WINDOWS`.
     """
     observation = getattr(factory, "observation", PAPER_WINDOWS)
     if not isinstance(observation, Mapping) or not set(observation) <= set(WINDOWS):
         allowed = ", ".join(WINDOWS)
         raise ValueError(
-            f"observation must be a dict with keys out of {allowed}, got {observation!r}"
+            f"the attribute observation must be a dict with keys from {allowed}, "
+            f"got {observation!r}"
         )
     return observation
 
@@ -206,9 +209,10 @@ def observation_of(factory: Factory) -> Mapping[str, int]:
 def make_controller(*, factory: Factory, **prior_knowledge: Any) -> Agent:
     """Call a user's factory, and return the controller that the factory makes.
 
-    `prior_knowledge` is what the controller may know about the plant, by name. The factory gets
-    what its parameters name, or everything if it has `**kwargs`. A ValueError is raised if the
-    factory needs another argument.
+    `prior_knowledge` has the quantities of the plant that the controller may know, by name. A
+    factory gets the quantities that are named in its signature, or all quantities if the
+    signature has `**kwargs`. A ValueError is raised if the factory needs an argument that is
+    not in `prior_knowledge`.
     """
     signature = inspect.signature(factory)
     parameters = signature.parameters
@@ -236,18 +240,18 @@ def make_controller(*, factory: Factory, **prior_knowledge: Any) -> Agent:
 
 @dataclass
 class PolicyAgent:
-    """A policy in any form that `mptc_gym.evaluate` takes, as a controller of the benchmarks.
+    """A controller that uses a policy in any form that `mptc_gym.evaluate` accepts.
 
     Attributes
     ----------
     policy
         The policy.
     env
-        The environment that the policy acts in, or a function that makes an environment. None
-        stands for the environment that was saved with a model of Stable-Baselines3, or for
-        `MiddlePoint-v0` without wrappers if no environment was saved.
+        Environment that the policy acts in, or a function that makes the environment. If `env`
+        is None, the policy acts in the environment that was saved with a Stable-Baselines3
+        model, or in `MiddlePoint-v0` without wrappers if no environment was saved.
     runs : int
-        Number of runs in a batch.
+        Number of runs that the policy controls at once.
     """
 
     policy: Any
@@ -259,29 +263,32 @@ class PolicyAgent:
         self._act = start(self.policy, self.runs)
 
     def act(self, observation: Any) -> Any:
-        """Return the actions for observations with a row for each run, shape (runs, 1)."""
+        """Return the actions for an observation with a row for each run, shape (runs, 1)."""
         return self._act(observation)
 
     @contextmanager
     def opened(self, samples: int, **arguments: Any) -> Iterator[Any]:
         """Yield a vector environment of `runs` plants with the wrappers that the policy needs.
 
-        Episodes have `samples` samples, and `arguments` are the arguments of the environment
-        that define the case. A ValueError is raised if the policy brings its own environment
-        for another case, or if the policy does not fit the observations.
+        An episode has `samples` samples. `arguments` are arguments of `MiddlePoint-v0`, which
+        define the plant and the set point. A ValueError is raised if the policy's own
+        environment has a different plant or set point, or if the policy does not fit the
+        observations.
         """
         case = case_of(Parameters(**arguments))
         with self._open({**arguments, "max_episode_steps": samples}) as plants:
             if any(case_of(group.parameters) != case for group in plant_groups(plants)):
-                raise ValueError("the environment must have the parameters of the case")
+                raise ValueError(
+                    "the policy's environment must have the case's plant and set point"
+                )
             check_fit(self.policy, plants)
             yield plants
 
     def _open(self, arguments: Mapping[str, Any]) -> AbstractContextManager[Any]:
-        """Return a context with a vector environment of `runs` plants.
+        """Return a context manager of a vector environment with `runs` plants.
 
-        `arguments` are the keyword arguments of `gymnasium.make` for the case, which an
-        environment that the policy brings does not need.
+        `arguments` are keyword arguments of `gymnasium.make`. If the policy has an environment
+        of its own, `arguments` are not used.
         """
         if self.env is not None:
             return opened(self.env, self.runs, self.policy)
@@ -289,7 +296,7 @@ class PolicyAgent:
             return opened(IDS["paper"], self.runs, self.policy, **arguments)
         from mptc_gym.sb3 import spec_of
 
-        # A saved model has the windows and wrappers of its training.
+        # The windows and the wrappers are those in which the saved model was trained.
         without_windows = {name: arguments[name] for name in arguments if name not in WINDOWS}
         spec = spec_of(self.policy, **without_windows)
         return opened(spec, self.runs, self.policy)

@@ -1,4 +1,4 @@
-"""Define the record of a controller, and what a controller may know about a plant."""
+"""Define `ControllerSpec`, and compute what a controller may know about a plant."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,12 +14,12 @@ from mptc_gym import Parameters
 from mptc_gym.plant.signals import SetPointLevels
 
 LEARNING = 1200  # samples of the square wave in which a controller learns before it is measured
-COMMISSIONING_SEED = SEEDS["preparation"].first  # of the plants and noise of this learning
-# Ms, the maximum sensitivity of the loop, to which the time constant of a controller is chosen.
-# The rule SIMC without this choice leads to an Ms of 1.56.
+COMMISSIONING_SEED = SEEDS["preparation"].first  # of the episodes in which a controller learns
+# Maximum sensitivity Ms of the control loop, from which a controller's time constant is chosen.
+# The time constant of the tuning rule SIMC leads to an Ms of 1.56.
 ROBUSTNESS = 1.6
 
-# Names of quantities that some controllers may know about the plant; see `knowledge`.
+# Names of quantities of a plant that some controllers know: arguments of `knowledge`.
 LIMITS = "u_min", "u_max"
 DIRECTION = *LIMITS, "direction", "num_envs", "seed"
 STEP_TEST = *LIMITS, "gain", "time_constant", "delay", "sampling_interval"
@@ -30,9 +30,9 @@ EVERYTHING = "parameters", "num_envs", "seed"
 
 
 def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> dict[str, Any]:
-    """Return what a controller may know about a plant, by the names of the quantities.
+    """Return what a controller may know about a plant, as a dict of quantities by name.
 
-    The values are arguments for the constructor of a controller.
+    The returned dict has keyword arguments for the constructor of a controller.
 
     Parameters
     ----------
@@ -40,16 +40,16 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
         Names of the quantities to return: `parameters` (all arguments of the environment),
         `num_envs` (`runs`), `seed`, `u_min`, `u_max`, `dead_zone` and `widest_dead_zone` (t/h),
         `delay_range` (s), `setpoint_holds` (s), `setpoint_amplitude` (degC), `direction` (the
-        sign of the gain, 1 or -1), and the results of `step_test`: `gain` (degC per t/h),
+        sign of the gain, 1 or -1), and the results of a step test: `gain` (degC per t/h),
         `time_constant`, `delay` and `sampling_interval` (s).
     plant
-        The plant. Where quantities of the plant have ranges, the limits are the widest limits,
-        the dead zone is the middle of its range, and the step test is that of the plant in the
-        middle of all ranges.
+        Arguments of the environment. If arguments are ranges, `u_min` and `u_max` are the
+        widest limits of the flow, `dead_zone` is the middle of the range, and the step test is
+        made with the plant in the middle of all ranges.
     runs
-        Number of runs in a batch.
+        Number of runs that the controller controls at once.
     seed
-        Seed of the controller's random numbers in the first run; run i uses `seed + i`.
+        Seed of the controller's random numbers in the first run; run i has the seed `seed + i`.
     """
     values: dict[str, Any] = {"parameters": plant, "num_envs": runs, "seed": seed}
     values["u_min"] = plant.range_of("u_min")[0]
@@ -69,9 +69,8 @@ def knowledge(names: Sequence[str], plant: Parameters, runs: int, seed: int) -> 
 def delay_range(plant: Parameters) -> tuple[float, float] | None:
     """Return the shortest and the longest delay of a plant, s; None if the delay is fixed.
 
-    A delay is here the time from a flow to the first output that the flow can affect, so it is
-    one sample longer than the argument `delay` of the environment. The range of `plant.delay`
-    gives the two delays.
+    The delay from a flow to the first output that the flow can affect is one sample longer than
+    the argument `delay` of the environment.
     """
     if not isinstance(plant.delay, Sequence):
         return None
@@ -81,10 +80,9 @@ def delay_range(plant: Parameters) -> tuple[float, float] | None:
 
 
 def setpoint_holds(plant: Parameters) -> tuple[float, float] | None:
-    """Return the shortest and the longest time for which a random set point is constant, s.
+    """Return the shortest and the longest time between changes of a random set point, s.
 
-    The result is None if the set point is not random. `plant` has the arguments of the
-    environment.
+    The result is None if the set point of the plant is not random.
     """
     levels = SetPointLevels(plant)
     if not levels.random:
@@ -94,68 +92,71 @@ def setpoint_holds(plant: Parameters) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSpec:
-    """The record of a controller: all that the commands need to run and describe it.
+    """The record of a controller: everything that commands need to run and describe it.
 
-    The nominal plant is the plant in the middle of the ranges of the environment's arguments.
+    The nominal plant has the middle value of each environment argument that is a range.
 
     Attributes
     ----------
     name : str
-        The name of the controller in options and files.
+        Name of the controller in command-line options and files.
     label : str
-        The name of the controller in tables and pictures.
+        Name of the controller in tables and pictures.
     look : tuple of str
-        The colour and the marker of the controller in pictures, for matplotlib.
+        Colour and marker of the controller in Matplotlib pictures.
     build : callable
-        Returns the controller. The keyword arguments are the prior knowledge, gains and time
-        constants by name, and also `network`, a trained network, if the record has `networks`.
+        Function that returns the controller. The keyword arguments of `build` are prior
+        knowledge, gains, time constants and, if `networks` is not None, a trained `network`.
     prior_knowledge : sequence of str
-        What the controller knows about the plant: names of quantities that the function
-        `knowledge` returns.
+        Names of the quantities of the plant that the controller knows, as listed in the
+        docstring of the function `knowledge`.
     knows : str
-        The prior knowledge in words, for tables.
+        Text for tables that describes the prior knowledge of the controller.
     searched : str
-        What was searched or trained beforehand, and in how many trials and samples, in words.
+        Text for tables that says what was searched or trained before a comparison, and in how
+        many trials and samples.
     tuned_by : str
-        The argument of `build`, a time constant in s, that is chosen such that the loop with
-        the nominal plant has a maximum sensitivity of `sensitivity`. The text is "" if the
-        controller has no such argument.
+        Name of the argument of `build`, a time constant in s, that is chosen so that the
+        maximum sensitivity of the control loop is `sensitivity`; "" if no argument is chosen.
     sensitivity : float
-        Ms, the largest magnitude of the sensitivity function of the loop.
+        Maximum sensitivity Ms of the control loop with the nominal plant: the largest magnitude
+        of the loop's sensitivity function.
     linear : bool
         Whether the controller is linear for commands outside the dead zone and within the
-        limits. A linear controller has a method `transfer`.
+        limits. A linear controller has a method `transfer`, which returns the transfer function
+        of the controller.
     assumes : sequence of str
-        What has to agree between the plant and the plant that the controller was made for: the
-        "direction" (the sign of the gain) or the "scale" (the magnitudes of gain, reachable
-        temperature, time constant and delay).
+        Properties in which the plant must agree with `made_for`: "direction" (the sign of the
+        gain) or "scale" (the magnitudes of gain, reachable temperature, time constant and
+        delay).
     made_for : mapping
-        The plant that the controller was made for, by the environment's arguments; empty for
-        the paper's plant.
+        Arguments of the environment for which the controller was made; empty for the paper's
+        plant.
     observation : mapping
-        How many samples of each signal the controller observes, by the environment's arguments,
-        such as `{"error_window": 3}`.
+        Number of samples of each signal that the controller observes, by the environment's
+        arguments, such as `{"error_window": 3}`.
     networks : callable, optional
-        Returns the networks that were trained for the controller, by file. The controller has
-        one member for each network, and a command runs all members.
+        Function that returns the controller's trained networks by file name. A member of the
+        controller is the controller with one of the networks; commands run all members.
     networks_are_alike : bool
-        Whether the networks hardly differ, so that most comparisons run the first network only.
+        Whether the networks hardly differ, so that most comparisons run only one network.
     random : bool
-        Whether the controller draws random numbers, such as its initial weights.
+        Whether the controller draws random numbers, such as initial weights.
     learns : bool
         Whether the controller goes on learning from one run to the next.
     spans : callable, optional
-        Takes a plant, and returns the interval in which a search looks for each gain. An
-        interval begins with its end of smaller magnitude; both ends have the same sign.
+        Function that takes a plant, and returns the interval in which a search looks for each
+        gain. Both ends of the interval have the same sign, and the first end has the smaller
+        magnitude.
     compared : bool
         Whether the command `compare` runs the controller by default.
     swept : bool
         Whether the command `sweep` runs the controller by default.
     pictured : bool
-        Whether a comparison draws the temperature and the flow over time with the controller.
+        Whether comparisons draw the temperature and the flow of the controller over time.
     provenance : mapping
-        The origin of the trained network of a member, as JSON can store it; empty if nothing
-        was trained.
+        Mapping that says how the network of a member was trained, for a JSON file; empty if
+        nothing was trained.
     """
 
     name: str
@@ -182,10 +183,9 @@ class ControllerSpec:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def members(self) -> "list[ControllerSpec]":
-        """Return a record for each trained network, in the order of the files' names.
+        """Return a `ControllerSpec` for each trained network, sorted by file name.
 
-        Each record builds the controller with one network. If the controller has no networks,
-        the list consists of this record.
+        If the controller has no trained networks, the result is the list `[self]`.
         """
         if self.networks is None:
             return [self]
@@ -202,9 +202,9 @@ class ControllerSpec:
         return members
 
     def with_few_networks(self) -> "ControllerSpec":
-        """Return a record with the first network only, if the networks are alike.
+        """Return a `ControllerSpec` with the first network only, if the networks are alike.
 
-        A controller whose networks are not alike, or that has none, keeps its record.
+        A controller without networks, or with networks that differ, is returned unchanged.
         """
         networks = self.networks
         if networks is None or not self.networks_are_alike:
@@ -217,10 +217,10 @@ class ControllerSpec:
         return replace(self, networks=first_network)
 
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
-        """Return a record of the controller with fixed gains.
+        """Return a copy in which arguments of `build`, by name, have the fixed values `gains`.
 
-        `gains` has arguments of `build` by name. If the argument `tuned_by` is among the
-        gains, `robust_time_constant` does not choose its value any more.
+        If `gains` has a value for the argument `tuned_by`, `robust_time_constant` no longer
+        chooses that value.
         """
         tuned_by = "" if self.tuned_by in gains else self.tuned_by
         return replace(self, build=partial(self.build, **gains), tuned_by=tuned_by)
@@ -228,8 +228,8 @@ class ControllerSpec:
     def make(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller for a batch of `runs` runs.
 
-        The controller's prior knowledge is that of `plant`, the environment's arguments. The
-        controller draws random numbers for run i with the seed `seed + i`.
+        The controller's prior knowledge is computed from `plant`, arguments of the environment.
+        The controller draws random numbers for run i with the seed `seed + i`.
         """
         parameters = Parameters(**{**plant, **self.observation})
         arguments = knowledge(self.prior_knowledge, parameters, runs, seed)
@@ -238,11 +238,11 @@ class ControllerSpec:
         return self.build(**arguments)
 
     def robust_time_constant(self, plant: Mapping[str, Any]) -> float:
-        """Return the time constant for the argument `tuned_by` of `build`, s.
+        """Return the smallest time constant, s, with a maximum sensitivity of `sensitivity`.
 
-        The result is the smallest time constant with which Ms, the maximum sensitivity of the
-        loop with the nominal plant, is at most `sensitivity`. `plant` has the environment's
-        arguments. The result is rounded to four digits, so that it is equal on all machines.
+        The time constant is that of the argument `tuned_by` of `build`, and the maximum
+        sensitivity is that of the control loop with the nominal plant. The time constant is
+        rounded to four digits, so that all machines return the same number.
         """
         parameters = Parameters(**plant)
         arguments = knowledge(self.prior_knowledge, parameters, 1, 0)
@@ -250,7 +250,7 @@ class ControllerSpec:
         def build(time_constant: float) -> Any:
             return self.build(**arguments, **{self.tuned_by: time_constant})
 
-        # The search covers all useful time constants between these two.
+        # All useful time constants are between `fastest` and `slowest`, s.
         slowest = 30.0 * (arguments["time_constant"] + arguments["delay"])
         fastest = 0.1 * arguments["sampling_interval"]
         model = nominal(parameters)
@@ -258,18 +258,15 @@ class ControllerSpec:
         return float(f"{exact:.4g}")
 
     def loop(self, plant: Mapping[str, Any]) -> LinearLoop:
-        """Return the loop of this controller, which must be linear, with the nominal plant.
-
-        `plant` has the environment's arguments.
-        """
+        """Return the control loop of this linear controller with the nominal plant."""
         controller: Any = self.make(plant, 1, 0)
         return LinearLoop.of(controller, nominal(Parameters(**plant)))
 
     def misfit(self, plant: Parameters) -> str:
-        """Return a sentence that says why the controller does not fit a plant; "" if it fits.
+        """Return why the controller does not fit `plant`, as a sentence; "" if it fits.
 
-        A controller fits a plant that agrees with the plant `made_for` in all that the
-        controller `assumes`.
+        The controller fits if `plant` agrees with the plant `made_for` in all properties of
+        `assumes`.
         """
         made_for = Parameters(**self.made_for)
         signs = {1: "positive", -1: "negative"}
@@ -299,28 +296,27 @@ class ControllerSpec:
         Parameters
         ----------
         plant
-            The environment's arguments.
+            Arguments of the environment.
         samples
             Length of a run, in samples.
         runs
             Number of runs in the batch.
         seed
-            Seed of the first run: the environment draws the random numbers of run i, such as
-            its noise, with the seed `seed + i`.
+            Seed of the first run. The environment draws the noise and all other random numbers
+            of run i with the seed `seed + i`.
         controller
-            A controller that `make` or `in_service` has returned for a batch of `runs` runs; by
-            default, a new one is made for `plant`.
+            Controller that `make` or `in_service` has returned for `runs` runs. By default,
+            `run` makes a new controller for `plant`.
         """
         agent = controller or self.make(plant, runs, seed)
         plants = make_plants(runs, samples, **{**plant, **self.observation})
         return rollout(plants, agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Make a controller for a batch of `runs` runs, let it learn if it can, and return it.
+        """Return a controller for `runs` runs, trained on `plant` if the controller learns.
 
-        Learning takes `LEARNING` samples of the square wave on the plant with the environment's
-        arguments `plant`. The controller draws random numbers for run i with the seed
-        `seed + i`.
+        A controller that learns is first run on `plant` for `LEARNING` samples of the square
+        wave.
         """
         controller = self.make(plant, runs, seed)
         if self.learns:

@@ -1,10 +1,9 @@
 """Make the command `python -m benchmarks.NAME` from a dataclass of options and a function.
 
-The module of a command defines a dataclass `Options` and a function `work`. The docstrings of
-`Options` are the text of `--help`. The function `work` takes an instance of `Options`, writes
-the results and returns the last line to print. Packages that are slow to import are imported
-within `work`, so that `--help` is quick. The line `main = command("NAME", Options, work)` makes
-the command.
+The module `benchmarks.NAME` defines a dataclass `Options`, whose docstrings are the text of
+`--help`, and a function `work(options)`, which writes results and returns the last line to
+print. The line `main = command("NAME", Options, work)` makes the command. Slow packages such as
+pandas are imported inside `work`, so that `--help` is quick.
 """
 
 import errno
@@ -43,8 +42,7 @@ DISK_FULL_OR_PIPE_CLOSED = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EPIPE
 def _to_integer(_type: object, tokens: Sequence[Any]) -> int:
     """Return the word that a user typed, `tokens[0].value`, as an integer.
 
-    A ValueError is raised if the word is not a whole number. Without this converter, cyclopts
-    would read 2.5 as 2.
+    The package cyclopts by itself would convert the word "2.5" to the integer 2.
     """
     word = tokens[0].value
     try:
@@ -54,12 +52,12 @@ def _to_integer(_type: object, tokens: Sequence[Any]) -> int:
 
 
 def _integers(least: int, most: int) -> Parameter:
-    """Return an annotation of an option that accepts integers from `least` to `most` only."""
+    """Return the annotation of an option whose value is an integer from `least` to `most`."""
     allowed = Number(gte=least, lte=most)
     return Parameter(converter=_to_integer, n_tokens=1, validator=allowed)
 
 
-# Types of options. No useful value exceeds the limits of the numbers.
+# Types of options. The upper limits of the integers are far above all useful values.
 Count = Annotated[int, _integers(1, 1_000_000_000)]
 Runs = Annotated[int, _integers(1, 100_000)]
 Seed = Annotated[int, _integers(0, 2**63)]
@@ -72,7 +70,8 @@ Folder = Annotated[Path, Parameter(help="The folder to write to.")]
 def blame(option: str) -> Iterator[None]:
     """Turn a ValueError in the block of a `with` statement into a `UsageError`.
 
-    The message begins with `option`, the name of an option such as "--device".
+    The message of the `UsageError` begins with `option`, the name of a command-line option such
+    as "--device".
     """
     try:
         yield
@@ -81,21 +80,21 @@ def blame(option: str) -> Iterator[None]:
 
 
 def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[str]:
-    """Return the names that a user has listed in an option, each once and in the same order.
+    """Return the names that a user typed after an option, in order and without repetitions.
 
     Parameters
     ----------
     option
-        The name of the option, such as "--scenarios", for the error message.
+        Name of the command-line option for the error message, such as "--scenarios".
     listed
-        The names that the user has listed.
+        Names that the user typed.
     names
         All valid names.
 
     Raises
     ------
     UsageError
-        If a listed name is not valid.
+        If a name in `listed` is not in `names`.
     """
     for name in listed:
         if name not in names:
@@ -104,19 +103,23 @@ def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[st
 
 
 def read(declared: type[Declared], program: str, words: Sequence[str]) -> Declared | None:
-    """Convert the words of a command line to options, or print the help after `--help`.
+    """Convert the words of a command line to an instance of the dataclass `declared`.
 
-    The result is an instance of the dataclass `declared`, or None if the help was printed. A
-    `UsageError` is raised if an option is unknown or has an invalid value.
+    If the user typed `--help`, the help is printed and the result is None.
 
     Parameters
     ----------
     declared
-        The dataclass of options.
+        Dataclass whose fields are the options of the command.
     program
-        The command, such as "python -m benchmarks.compare", for the help.
+        Name of the command in the help, such as "python -m benchmarks.compare".
     words
-        The words of the command line after the command.
+        Words that the user typed after the name of the command.
+
+    Raises
+    ------
+    UsageError
+        If an option in `words` is unknown or has an invalid value.
     """
     defaults = Parameter(negative=(), allow_repeating=True, show_default=_as_typed)
     app = App(
@@ -139,8 +142,7 @@ def read(declared: type[Declared], program: str, words: Sequence[str]) -> Declar
 def _as_typed(default: object) -> str | None:
     """Return the default of an option as a user would type it, for the text of `--help`.
 
-    The result is None, and the help shows no default, for an option that is off or empty by
-    default.
+    The result is None, so that `--help` shows no default, if `default` is None, False or ().
     """
     if default is None or default is False or default == ():
         return None
@@ -154,23 +156,23 @@ def command(
 ) -> Callable[..., int]:
     """Return the function `main` of the command `python -m benchmarks.NAME`.
 
-    `main(words)` takes the words of a command line after the command, by default the words with
-    which this process was started. The function `main` reads the options, calls `work`, and
-    returns the exit status of the command, as `run_program` does.
+    `main(words)` converts the command-line words `words` (default: `sys.argv[1:]`) to options,
+    calls `work` with the options, and returns the exit status that `run_program` describes.
 
     Parameters
     ----------
     name
         NAME, such as "compare".
     declared
-        The dataclass of options.
+        Dataclass whose fields are the options of the command.
     work
-        Does the work for an instance of `declared`, and returns the last line to print.
+        Function that takes an instance of `declared`, does the work of the command, and returns
+        the last line to print.
     """
     program = f"python -m benchmarks.{name}"
 
     def main(words: Sequence[str] | None = None) -> int:
-        if words is None:  # This process runs nothing but the command.
+        if words is None:  # The process was started for this command only.
             words = sys.argv[1:]
             _interrupt_on_signals()
 
@@ -188,18 +190,12 @@ def command(
 
 
 def run_program(program: str, work: Callable[[], str]) -> int:
-    """Call `work`, print the line that it returns, and return the exit status of a command.
+    """Call `work`, print the text that `work` returns, and return the command's exit status.
 
-    The status is 0 for success; 1 if tasks failed or nothing more could be written; 130 after
-    Ctrl-C; and 143 after SIGTERM. After a `UsageError`, or if a package is missing, this
-    process ends with status 2.
-
-    Parameters
-    ----------
-    program
-        The command, such as "python -m benchmarks.compare", which begins error messages.
-    work
-        Does the work, and returns the last line to print, or "".
+    The exit status is 0 for success; 1 if tasks failed, the disk is full or the output pipe is
+    closed; 130 after Ctrl-C; and 143 after SIGTERM. After a `UsageError`, or if a Python
+    package is missing, the process ends with the exit status 2. Error messages begin with
+    `program`, such as "python -m benchmarks.compare".
     """
     try:
         last_line = work()
@@ -210,7 +206,7 @@ def run_program(program: str, work: Callable[[], str]) -> int:
         stop(program, error)
     except KeyboardInterrupt as interrupt:
         print("\nInterrupted.", flush=True)
-        # Without a handler of this module, Python does not say which signal it was.
+        # `args` is empty if Python's own handler of Ctrl-C has raised the interrupt.
         number = interrupt.args[0] if interrupt.args else signal.SIGINT
         return 128 + int(number)
     except UnfinishedError as error:
@@ -219,7 +215,7 @@ def run_program(program: str, work: Callable[[], str]) -> int:
         if error.errno not in DISK_FULL_OR_PIPE_CLOSED:
             raise
         print(f"{program}: nothing more can be written: {error.strerror}", file=sys.stderr)
-        # Python writes the rest of its output at exit, which would raise the error again.
+        # At exit, Python writes the buffered output, which would raise the same error again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 1
 
@@ -227,8 +223,7 @@ def run_program(program: str, work: Callable[[], str]) -> int:
 def _interrupt_on_signals() -> None:
     """Make the first Ctrl-C or SIGTERM raise a KeyboardInterrupt in this process.
 
-    A signal that this process has ignored since its start stays ignored: a shell starts
-    commands in the background with Ctrl-C ignored.
+    A process that a shell has started in the background continues to ignore Ctrl-C.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -238,7 +233,8 @@ def _interrupt_on_signals() -> None:
 def _interrupt(number: int, _frame: object) -> NoReturn:
     """Raise a KeyboardInterrupt whose argument is the signal `number`.
 
-    Later signals are ignored, so that the command can write its finished results.
+    After the first Ctrl-C or SIGTERM, later signals are ignored, so that the command has time
+    to write finished results.
     """
     for later in (signal.SIGINT, signal.SIGTERM):
         signal.signal(later, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""Define the errors whose message a command prints without a traceback, and print a message."""
+"""Define exceptions that end a command with a message and without a traceback."""
 
 import sys
 from typing import NoReturn
@@ -25,41 +25,33 @@ EXTRAS = {
 
 
 class UsageError(ValueError):
-    """A user has given a command something invalid, such as an unknown name in an option.
+    """A command cannot run as the user typed it, for example because a name is unknown.
 
-    The message tells the user what is invalid and why. A command that raises a `UsageError`
-    ends with exit status 2.
+    A command that raises a `UsageError` ends with exit status 2.
     """
 
 
 class UnfinishedError(RuntimeError):
     """A command could not do all of its work.
 
-    The message tells the user what is missing. A command that raises an `UnfinishedError` ends
-    with exit status 1.
+    A command that raises an `UnfinishedError` ends with exit status 1.
     """
 
 
 class NoBoundError(ValueError):
-    """A scenario has no lower bound on the error, or no bound of the kind that was asked for.
+    """A scenario has no lower bound on the control error, or none of the requested kind.
 
-    For example, the bound of the kind "reference" exists only if the plant settles before each
-    change of the set point.
+    For example, a lower bound of the kind "reference" exists only if the plant settles before
+    each change of the set point.
     """
 
 
 def stop(program: str, error: UsageError | ImportError) -> NoReturn:
-    """Print the message of an error without a traceback, and exit with status 2.
+    """Print the message of `error` without a traceback, and exit with status 2.
 
-    If a package of `EXTRAS` is not installed, the message names the extra that installs the
-    package. Any other ImportError is a bug in the code, and is raised again.
-
-    Parameters
-    ----------
-    program
-        The command, such as "python -m benchmarks.compare", with which the message begins.
-    error
-        The error, which an ImportError may have caused.
+    The printed message begins with the command `program`. If a package from an extra of this
+    project is not installed, the message names the extra. An ImportError for any other package
+    is a bug, and is raised again.
     """
     message = str(error)
     cause = error.__cause__ or error

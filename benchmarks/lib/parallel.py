@@ -18,13 +18,13 @@ from benchmarks.lib.provenance import ROOT
 from benchmarks.lib.results import KeptResults
 
 # A part of a command's work: a function without arguments that can run in another process, such
-# as a `functools.partial` of a function of a module.
+# as a `functools.partial` of a module's function.
 Task = Callable[[], Any]
 LISTED_FAILURES = 20  # largest number of failed tasks that a message lists
 
 
 class Outcome(NamedTuple):
-    """The outcome of a task that has ended."""
+    """The result of a task, or the reason why the task failed."""
 
     task: str  # the name of the task
     result: Any  # what the task returned; None if the task failed
@@ -34,10 +34,10 @@ class Outcome(NamedTuple):
 @options
 @dataclass(frozen=True, kw_only=True)
 class FanOut:
-    """The options that say how many tasks run at once, and where the tasks run.
+    """The options `--jobs` and `--backend`: how many tasks run at once, and on which machines.
 
-    With `--jobs 1`, tasks run in this process. The result of a task does not depend on these
-    two options if all random numbers of the task come from seeds in its arguments.
+    A task that draws all random numbers from seeds in its arguments has the same result with
+    all values of `--jobs` and `--backend`.
     """
 
     jobs: Count | None = None
@@ -50,23 +50,23 @@ class FanOut:
     ) -> Iterator[tuple[str, Any]]:
         """Run tasks, and yield the name and the result of each task that has succeeded.
 
-        A result is yielded as soon as the task has finished, in any order. On a Ray cluster,
-        all results are yielded at the end.
+        Results are yielded in the order in which tasks finish. With `--backend ray`, results
+        are yielded only after the last task has finished.
 
         Parameters
         ----------
         tasks
-            The tasks by name.
+            Tasks by name: functions without arguments.
         title
             Title of the progress bar.
         store
-            Stored results, which are yielded first: their tasks are not run. The results of
-            tasks that run are added to the store.
+            Results that an interrupted run of the command has saved. A task with a saved result
+            does not run again; the results of all other tasks are saved in `store`.
 
         Raises
         ------
         UnfinishedError
-            At the end, if tasks failed. The message names the failed tasks and their errors.
+            If tasks failed. The error is raised after all other tasks have finished.
         """
         missing: dict[str, Task] = {}
         failures: list[Outcome] = []
@@ -90,12 +90,12 @@ class FanOut:
             raise UnfinishedError(_summary(failures, len(tasks)))
 
     def _outcomes(self, tasks: Mapping[str, Task]) -> Iterator[Outcome]:
-        """Run tasks, and yield the outcome of each task when the task has ended, in any order.
+        """Run tasks, and yield an `Outcome` for each task, in the order in which tasks end.
 
         Raises
         ------
         UnfinishedError
-            If the system killed a process that ran tasks.
+            If the operating system killed a worker process.
         """
         import joblib  # imported here, as it is slow to import
 
@@ -105,7 +105,7 @@ class FanOut:
             yield from joblib.Parallel(self.jobs or -1, backend="ray")(calls)
             return
         jobs = min(self.jobs or joblib.cpu_count(), len(calls))
-        jobs = max(jobs, 1)  # There are no calls if all results are stored.
+        jobs = max(jobs, 1)  # `calls` is empty if all results are stored.
         with joblib.parallel_config(
             "loky",
             inner_max_num_threads=1,
@@ -113,7 +113,7 @@ class FanOut:
             initargs=(os.getpid(),),
         ):
             parallel = joblib.Parallel(jobs, return_as="generator_unordered", batch_size=1)
-        # The processes that start here ignore Ctrl-C, too.
+        # The worker processes inherit this handler, so a Ctrl-C does not end them.
         handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             outcomes = parallel(calls)
@@ -123,15 +123,15 @@ class FanOut:
             yield from outcomes
         except BrokenProcessPool as error:
             raise UnfinishedError(
-                "a process was killed, perhaps because memory ran out: try fewer --jobs"
+                "a process that ran tasks was killed, perhaps because memory ran out: "
+                "try fewer --jobs"
             ) from error
 
 
 def _attempt(name: str, task: Task) -> Outcome:
-    """Run the task called `name`, in any process, and return the outcome of the task.
+    """Run the task called `name`, and return an `Outcome` with the result or the error.
 
-    If the task raises an error, the outcome has the error as text, since some exceptions cannot
-    be pickled.
+    An `Outcome` holds an error as text, because some exceptions cannot be pickled.
     """
     try:
         return Outcome(name, task(), "")
@@ -143,10 +143,9 @@ def _attempt(name: str, task: Task) -> Outcome:
 
 
 def _summary(failures: Sequence[Outcome], tasks: int) -> str:
-    """Return a message with the first line of each task's error, and all of the first error.
+    """Return a message that lists failed tasks, and ends with the whole first error.
 
-    `failures` are the outcomes of the failed tasks, and `tasks` is the number of all tasks,
-    also of those that succeeded.
+    `tasks` is the number of failed and successful tasks together.
     """
     lines = [f"{len(failures)} of {tasks} tasks failed; the other tasks have finished"]
     for failure in failures[:LISTED_FAILURES]:
@@ -156,10 +155,10 @@ def _summary(failures: Sequence[Outcome], tasks: int) -> str:
 
 
 def _prepare_worker(parent: int) -> None:
-    """Make this worker process ignore Ctrl-C, and end when its parent process has ended.
+    """Make a worker process ignore Ctrl-C, and end soon after its parent process has ended.
 
-    A terminal sends Ctrl-C to all processes, and the parent ends its workers. `parent` is the
-    process identifier of the parent.
+    After Ctrl-C, which a terminal sends to all processes, the parent process ends the worker
+    processes. `parent` is the process identifier of the parent process.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -173,11 +172,10 @@ def _prepare_worker(parent: int) -> None:
 
 @contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
-    """Show a progress bar during the block of a `with` statement.
+    """Show a progress bar for `total` tasks during the block of a `with` statement.
 
-    The block calls the yielded function, without arguments, each time a task has finished.
-    `total` is the number of tasks. The bar is hidden if the standard error stream is not a
-    terminal.
+    Each call of the yielded function, without arguments, advances the progress bar by one task.
+    The progress bar is hidden if the standard error stream is not a terminal.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -191,20 +189,21 @@ def progress_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
 def _connect_to_ray() -> None:
     """Connect this process to a Ray cluster, and make "ray" a backend of joblib.
 
-    The environment variable RAY_ADDRESS has the address of the cluster; by default, a cluster
-    on this machine is looked for. Ray copies the code of the checkout to the nodes of the
+    The environment variable RAY_ADDRESS has the address of the Ray cluster (default: a Ray
+    cluster on this machine). Ray copies the source code of the project to all nodes of the
     cluster.
 
     Raises
     ------
     UsageError
-        If no cluster can be reached.
+        If no Ray cluster can be reached.
     """
     import ray  # imported here, as it is optional and slow to import
     from ray.util.joblib import register_ray
 
     register_ray()
-    # The tasks need the code alone: the patterns with "!" make exceptions from the first one.
+    # Tasks need only the source code: "/*" excludes all files and folders, and a pattern with
+    # "!", as in .gitignore, includes a folder again.
     excluded = ["/*", "!/.", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py"]
     excluded += ["published", "*.md"]
     try:

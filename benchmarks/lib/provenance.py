@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]  # the checkout
 CODE_FOLDERS = "mptc_gym", "agents", "benchmarks"
 # Source files, trained networks (.npz) and the error bounds of the package (.json).
 CODE_SUFFIXES = {".py", ".npz", ".json"}
-# Packages other than Python itself whose versions may change a result.
+# Packages whose versions may change a result.
 PACKAGES = "gymnasium", "numpy", "optuna", "scipy", "stable_baselines3", "torch"
 
 # The command line that this process executes, such as "python -m benchmarks.compare"; "" if a
@@ -26,8 +26,8 @@ COMMAND_LINE: ContextVar[str] = ContextVar("COMMAND_LINE", default="")
 def origin() -> dict[str, Any]:
     """Return the provenance of results that are computed now, as a dict that JSON can store.
 
-    The keys are "started" (the present time, UTC, ISO 8601), "command" (the command line),
-    "versions" (of packages), "commit" (of git) and "code" (a hash of the source files).
+    The keys of the dict are "started" (the present time, UTC, ISO 8601), "command" (the command
+    line), "versions" (of packages), "commit" (of git) and "code" (a hash of the source files).
     """
     return {
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -51,12 +51,12 @@ def versions() -> dict[str, str]:
 
 @cache
 def commit() -> str:
-    """Return the hash of the git commit of the checkout, 40 digits.
+    """Return the hash of the git commit that is checked out, 40 hexadecimal digits.
 
-    If files of the checkout differ from the commit, "-dirty" follows the hash. If git is not
-    installed or the checkout is not a git repository, the result is "".
+    If files have changed since the commit, the text "-dirty" follows the hash of the commit. If
+    git is not installed or the project is not in a git repository, the result is "".
     """
-    if not (ROOT / ".git").exists():  # git would look around the checkout.
+    if not (ROOT / ".git").exists():  # git would search the parent folders.
         return ""
     command = ["git", "status", "--porcelain=v2", "--branch"]
     try:
@@ -65,7 +65,7 @@ def commit() -> str:
         return ""
     lines = status.stdout.splitlines()
     identifier = lines[0].split()[-1]  # of "# branch.oid COMMIT"
-    is_clean = all(line.startswith("#") for line in lines)  # The other lines name files.
+    is_clean = all(line.startswith("#") for line in lines)  # Other lines name changed files.
     return identifier if is_clean else f"{identifier}-dirty"
 
 
@@ -73,7 +73,7 @@ def commit() -> str:
 def code_hash() -> str:
     """Return a SHA-256 hash of the files in `CODE_FOLDERS` with a suffix in `CODE_SUFFIXES`.
 
-    Files in folders called "published", which have results and no code, do not count.
+    The hash leaves out folders called "published", which contain results and no code.
     """
     digest = hashlib.sha256()
     for folder in CODE_FOLDERS:

@@ -1,8 +1,8 @@
-"""Keep the results of a command in a folder, also if the command is interrupted.
+"""Keep the results of a command in a folder, even if the command is interrupted.
 
-A command that is to write to the folder `NAME` first writes to the folder `NAME.unfinished`. At
-the end of the command, `NAME.unfinished` replaces `NAME`, so that no file of an earlier run of
-the command stays beside a new report. In this module, a run is one execution of a command.
+A command writes results for the folder `NAME` to the folder `NAME.unfinished`. When the command
+has finished, the folder `NAME.unfinished` replaces the folder `NAME`, so that old and new
+results are never mixed. In this module, a run is one execution of a command.
 """
 
 import hashlib
@@ -21,8 +21,8 @@ from benchmarks.lib.errors import UnfinishedError, UsageError
 from benchmarks.lib.provenance import COMMAND_LINE, code_hash, versions
 from benchmarks.lib.storage import out_folder, write_json
 
-# Names in a folder of results: the file with the conditions and the names of the written files,
-# and the folder with the results of the finished tasks of an unfinished run.
+# Names in a folder of results: the file with the conditions of the run and the names of the
+# written files, and the folder with the results of finished tasks during a run.
 RECORD_FILE = "run.json"
 TASKS_FOLDER = "tasks"
 FILE_MANAGER_FILES = {".DS_Store", "Thumbs.db"}  # files that file managers add to a folder
@@ -31,28 +31,29 @@ WITHOUT_INFLUENCE = {"out", "fan_out"}  # fields of `Options` on which no result
 
 @contextmanager
 def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) -> Iterator[Path]:
-    """Yield a folder to write to, which replaces the folder `target` at the end of the block.
+    """Yield a folder for new results, which replaces `target` at the end of the `with` block.
 
-    The yielded folder lies beside `target` and has the name of `target` with `.unfinished`
-    after it. If the block of the `with` statement raises an error or is interrupted, the
-    yielded folder is kept with the files in it, and `target` stays as it was.
+    The yielded folder for the `target` "results/x", for example, is "results/x.unfinished". If
+    the `with` block raises an error or is interrupted, the yielded folder is kept with the
+    results in it, and the folder `target` does not change.
 
     Parameters
     ----------
     target
-        The folder that the user has chosen by `--out`.
+        Folder that the user has chosen by the option `--out`.
     conditions
-        All that the results depend on, as `conditions_of` returns it. If an unfinished run with
-        equal conditions has left its folder, this folder is yielded, with the files in it.
-        Otherwise, and if `conditions` is None, the yielded folder is empty.
+        Everything that the results depend on, as returned by `conditions_of`. If an unfinished
+        run with equal conditions has left a folder, `results_folder` yields that folder with
+        the results in it. If `conditions` is None, the yielded folder is always empty.
 
     Raises
     ------
     UsageError
-        If `target` holds the current folder or cannot be written to, if another process is
-        writing to `target`, or if `target` or the yielded folder has files that no run wrote.
+        If `target` is the current folder or a folder above it, cannot be written to, or is in
+        use by another process; or if `target` or the folder to yield has files that no command
+        wrote.
     UnfinishedError
-        If the yielded folder cannot be renamed to `target` at the end.
+        If the yielded folder cannot replace `target` after the `with` block.
     """
     final = target.resolve()
     if Path.cwd().is_relative_to(final):
@@ -81,15 +82,15 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
 
 
 def _lock(final: Path) -> AbstractContextManager[object]:
-    """Lock the folder `final`, and return a context whose end unlocks the folder.
+    """Lock the folder `final`, and return a context manager that unlocks it at the end.
 
-    The folder need not exist: the lock is a hidden file beside the folder. The operating system
-    unlocks the folder if this process is killed.
+    The lock is a hidden file beside the folder `final`, which need not exist. If the process is
+    killed, the operating system releases the lock.
 
     Raises
     ------
     UsageError
-        If another process has locked the folder.
+        If another process has locked the folder `final`.
     """
     from filelock import FileLock, Timeout  # imported here, as --help needs no lock
 
@@ -102,9 +103,9 @@ def _lock(final: Path) -> AbstractContextManager[object]:
 
 
 def _files(folder: Path) -> list[str]:
-    """Return the sorted names of the files and folders in a folder, which need not exist.
+    """Return the sorted names of files and folders in `folder`, except `FILE_MANAGER_FILES`.
 
-    The names in `FILE_MANAGER_FILES` are left out.
+    If `folder` does not exist, the result is an empty list.
     """
     if not folder.exists():
         return []
@@ -112,10 +113,10 @@ def _files(folder: Path) -> list[str]:
 
 
 def _record(folder: Path) -> dict[str, Any]:
-    """Return the content of the file `RECORD_FILE` in a folder of results.
+    """Return the content of the file `RECORD_FILE` in a folder of results, as a dict.
 
-    The keys are "command", "conditions" and, after a finished run, "files". If the file is
-    missing or is not JSON, the dict is empty.
+    The keys of the dict are "command", "conditions" and, after a finished run, "files". The
+    dict is empty if `RECORD_FILE` is missing or is not JSON.
     """
     try:
         record: dict[str, Any] = json.loads((folder / RECORD_FILE).read_text(encoding="utf-8"))
@@ -125,10 +126,7 @@ def _record(folder: Path) -> dict[str, Any]:
 
 
 def _refuse_other_files(final: Path) -> None:
-    """Raise a `UsageError` if the folder `final` has files that no finished run has recorded.
-
-    So a command never replaces a folder with files of the user.
-    """
+    """Raise a `UsageError` if the folder `final` has files that no command wrote."""
     if final.exists() and not final.is_dir():
         raise UsageError(f"--out: {final} cannot be written to: it is not a folder")
     recorded = {RECORD_FILE, *_record(final).get("files", [])}
@@ -142,15 +140,14 @@ def _refuse_other_files(final: Path) -> None:
 
 
 def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
-    """Prepare the folder `unfinished`, which `results_folder` yields.
+    """Empty the folder `unfinished`, unless a run with equal `conditions` has left the folder.
 
-    If a run with equal `conditions` has left the folder, the folder stays as it is. Otherwise,
-    and if `conditions` is None, the folder becomes empty except for the file `RECORD_FILE`.
+    A folder that was emptied gets a new file `RECORD_FILE` with `conditions`.
 
     Raises
     ------
     UsageError
-        If the folder has files, but no valid `RECORD_FILE`: then no run has written the files.
+        If the folder `unfinished` has files, but no valid `RECORD_FILE`.
     """
     record = _record(unfinished)
     has_files = bool(_files(unfinished))
@@ -170,8 +167,8 @@ def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
 def _replace(final: Path, unfinished: Path) -> None:
     """Replace the folder `final` by the folder `unfinished` of a run that has finished.
 
-    The names of the run's files are added to `RECORD_FILE`, and the results of single tasks are
-    removed.
+    Before the replacement, the names of all result files are added to `RECORD_FILE`, and the
+    folder `TASKS_FOLDER` is removed.
     """
     _refuse_other_files(final)  # Somebody may have added files since the run began.
     shutil.rmtree(unfinished / TASKS_FOLDER, ignore_errors=True)
@@ -186,18 +183,19 @@ def _replace(final: Path, unfinished: Path) -> None:
 
 
 def conditions_of(command: str, options: Any) -> dict[str, Any]:
-    """Return all that the results of a command depend on, as a dict that JSON can store.
+    """Return everything that the results of a command depend on, as a dict for JSON.
 
-    Two runs of a command with equal conditions have equal results. The conditions are the name
-    of the command, its options, a hash of the code, and the versions of Python and of packages.
+    The dict has the name of the command, the options, a hash of the source code, and the
+    versions of Python and of packages. If the dicts of two runs are equal, the results of the
+    two runs are equal.
 
     Parameters
     ----------
     command
-        The name of the command, such as "sweep".
+        Name of the command, such as "sweep".
     options
-        The command's options, a dataclass. An option that is a file is replaced by a hash of
-        the content of the file. The options in `WITHOUT_INFLUENCE` are left out.
+        Dataclass with the options of the command. In the returned dict, a hash of a file's
+        content replaces the file's path, and the options in `WITHOUT_INFLUENCE` are left out.
     """
     conditions = {
         "command": command,
@@ -210,19 +208,15 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
 
 
 def _relevant(options: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return pairs of name and value as a dict, without the names in `WITHOUT_INFLUENCE`.
-
-    `dataclasses.asdict` calls this function for the dataclass of options, and for each
-    dataclass in it.
-    """
+    """Return pairs of name and value as a dict, without the names in `WITHOUT_INFLUENCE`."""
     return {name: value for name, value in options if name not in WITHOUT_INFLUENCE}
 
 
 def _content(value: object) -> str:
-    """Return an object that JSON cannot store as text, for `json.dumps`.
+    """Convert `value`, whose type JSON does not have, to text for `json.dumps`.
 
-    The text is a SHA-256 hash of the content if `value` is the path of a file, and otherwise
-    `str(value)`.
+    The path of a file is converted to a SHA-256 hash of the file's content, and every other
+    object to `str(value)`.
     """
     if isinstance(value, Path) and value.is_file():
         return hashlib.sha256(value.read_bytes()).hexdigest()
@@ -235,32 +229,33 @@ def save_arrays(path: Path, result: Mapping[str, Any]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, Any]:
-    """Return the numbers and arrays of the NPZ file `path` by name, as saved by `save_arrays`.
+    """Return the numbers and arrays, by name, that `save_arrays` has saved in the NPZ `path`.
 
-    NumPy refuses pickled objects with a ValueError, since loading them could run foreign code.
+    NumPy raises a ValueError for an NPZ
+    file with pickled objects, since loading pickled objects could run foreign code.
     """
     result = {}
     with np.load(path) as arrays:
         for name, array in arrays.items():
-            # A number was saved as an array without dimensions.
+            # NumPy saves a number as an array without dimensions.
             result[name] = array if array.ndim else array.item()
     return result
 
 
 @dataclass(frozen=True)
 class KeptResults:
-    """The results of finished tasks, one file each, with which an interrupted run can continue.
+    """Files with the results of finished tasks, from which an interrupted run can continue.
 
-    `results_folder` removes the files when the whole run has finished.
+    When a command has finished, the function `results_folder` removes these files.
 
     Attributes
     ----------
     folder : Path
-        The folder that `results_folder` yields. The files are in its folder `TASKS_FOLDER`.
+        Folder that `results_folder` yields; the files are in the subfolder `TASKS_FOLDER`.
     save_file : callable
-        Saves the result of a task to a file: `save_file(path, result)`.
+        Function `save_file(path, result)` that saves the result of a task to a file.
     load_file : callable
-        Returns the result of a task from a file: `load_file(path)`.
+        Function `load_file(path)` that returns the result of a task from a file.
     """
 
     folder: Path
@@ -279,7 +274,7 @@ class KeptResults:
     def save(self, name: str, result: Any) -> None:
         """Write `result`, the result of the task called `name`, to the file of the task.
 
-        A run that is killed leaves either the whole file or no file of this name.
+        If the process is killed, the file of the task is either complete or missing.
         """
         path = self.path(name)
         path.parent.mkdir(exist_ok=True)

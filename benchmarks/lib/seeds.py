@@ -1,8 +1,8 @@
 """Define the ranges of seeds that training, searches and published results use.
 
-A seed of the environment determines all random numbers of an episode. The ranges do not
-overlap, so no controller is measured in episodes on which the controller was trained or chosen.
-Random generators that make no episodes, such as that of a bootstrap, have seeds from 0 on.
+A seed of the environment determines all random numbers of an episode. The ranges of seeds do
+not overlap, so no controller is measured in episodes on which the controller was trained or
+chosen. Random numbers outside of episodes, such as those of a bootstrap, have seeds from 0 on.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from mptc_gym import evaluation
 
 @dataclass(frozen=True)
 class Block:
-    """A range of `count` consecutive seeds from the seed `first` on, and its purpose."""
+    """The `count` consecutive seeds from the seed `first` on, and the purpose of the seeds."""
 
     first: int
     count: int
@@ -20,7 +20,7 @@ class Block:
 
     @property
     def seeds(self) -> range:
-        """All seeds of the block, in rising order."""
+        """The seeds in rising order."""
         return range(self.first, self.first + self.count)
 
 

@@ -1,4 +1,4 @@
-"""Write texts and tables to files, with the same bytes on all systems."""
+"""Write text, JSON and CSV files with the same bytes on all operating systems."""
 
 import json
 import re
@@ -17,7 +17,7 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write `value` to the JSON file `path`.
 
-    Objects of types that JSON does not have, such as paths, are written as `str(object)`.
+    Objects whose type JSON does not have, such as paths, are written as `str(object)`.
     """
     write_text(path, json.dumps(value, indent=2, default=str) + "\n")
 
@@ -28,19 +28,19 @@ def write_csv(path: Path, table: Any) -> None:
 
 
 def out_folder(folder: Path, option: str = "--out") -> Path:
-    """Create a folder with its parent folders if it is missing, and return the folder.
+    """Create `folder` with its parent folders, if `folder` is missing, and return `folder`.
 
     Parameters
     ----------
     folder
-        The folder, which a user has chosen by an option of a command.
+        Folder that a user has chosen by a command-line option.
     option
-        The option, such as "--out", which the error message names.
+        Name of the command-line option for the error message, such as "--out".
 
     Raises
     ------
     UsageError
-        If the folder cannot be created, or if no file can be written to the folder.
+        If `folder` cannot be created, or if no file can be written to `folder`.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -52,9 +52,8 @@ def out_folder(folder: Path, option: str = "--out") -> Path:
 
 
 def file_name(text: str) -> str:
-    """Return `text` in a form that is safe as part of a file name.
+    """Return `text` as a safe part of a file name, with at most 100 characters.
 
-    Characters other than letters, digits, `-` and `_` become `_`, so the result contains no
-    path separator. The result has at most 100 characters.
+    Each character of `text` that is not a letter, a digit, `-` or `_` becomes `_`.
     """
     return re.sub(r"[^\w-]", "_", text)[:100]

@@ -22,17 +22,17 @@ NETWORKS = {"neural": "neural", "ppo": "ppo", "ppo-hard": "ppo"}
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Train the neural controllers: by the gradient through the plant, or by PPO.
+    """Train the neural controllers by gradients through simulated plants, or by PPO.
 
-    If a command was stopped before it had trained all networks, the same command with the same
-    code trains the missing networks.
+    After an interruption, the same command with the same code trains only the networks that are
+    still missing.
     """
 
     network: Annotated[str, Parameter(choices=NETWORKS)] = field(kw_only=False)
     """The kind of network to train."""
     networks: Count = 5
-    """The number of networks to train, each from a seed of its own. All are compared: none is
-    chosen."""
+    """The number of networks to train, each from a different seed. All trained networks are
+    written, and none is chosen by its result."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     steps: Count | None = None
     """The length of a training: steps of the optimiser or, for PPO, samples of experience
@@ -42,7 +42,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Train networks, save them, print their validation and return the closing message.
+    """Train and save networks, print the validation results, and return the last line to print.
 
     A `UsageError` is raised if the options name a plant for a network other than "ppo".
     """
@@ -50,7 +50,7 @@ def work(options: Options) -> str:
     module = importlib.import_module(f"benchmarks.train.{NETWORKS[name]}")
     recipe = module.RECIPES[name]
     train = module.train
-    stem = name  # of the names of the files
+    stem = name  # beginning of the names of the files
     if options.plant.name:
         if name != "ppo":
             raise UsageError(f"--plant, --preset and --set are for ppo, not for {name}")
@@ -75,14 +75,14 @@ def work(options: Options) -> str:
 
 
 def save_network(path: Path, network: Any) -> None:
-    """Save a network by its method `save` in the file `path`."""
+    """Save `network` in the file `path`."""
     network.save(path)
 
 
 def show_validation(networks: Mapping[int, Any]) -> None:
     """Print a table with the validation results of trained networks, a row for each network.
 
-    `networks` has the networks by the seeds of their training.
+    The keys of `networks` are the seeds of the trainings.
     """
     import pandas as pd
 

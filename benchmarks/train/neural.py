@@ -1,18 +1,14 @@
 """Train the network that corrects the self-tuning controller, by gradients through plants.
 
-The control error is differentiated with respect to the network's weights, back through plant,
-actuator and control law. The literature calls this training differentiable predictive control
-(J. Drgona et al., "Differentiable predictive control: deep learning alternative to explicit
-model predictive control for unknown nonlinear systems", Journal of Process Control 116, 2022,
-80-92).
+The gradient of the control error with respect to the network's weights is computed by
+backpropagation through the plant, the actuator and the control law. The literature calls such a
+training differentiable predictive control (Drgona et al., "Differentiable predictive control:
+deep learning alternative to explicit model predictive control for unknown nonlinear systems",
+Journal of Process Control 116, 2022, 80-92).
 
-The training is fast for two reasons:
-
-- Only the control law and the plant have gradients. The bank of models and its estimates are
-  computed in NumPy, and count as constants.
-- The loss is an expected error. The error at the sample k depends on commands up to the sample
-  k - d - 1, where d is the plant's delay. The effects of later noise and of later changes of
-  the set point are averaged by a formula, and not by random samples.
+The training is fast, because the estimates of the plants' parameters are computed in NumPy,
+without gradients, and because the loss is an expected control error: a formula averages over
+later noise and later changes of the set point.
 """
 
 import copy
@@ -45,15 +41,15 @@ from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 load = RecurrentNetwork.load
-# Least standard deviation of the noise in the expected error, degC. For plants with little
-# noise, it rounds the kink of |e| at 0.
+# Least standard deviation of the noise in the expected error, degC. This limit rounds the kink
+# of |e| at 0 for plants with little noise.
 LEAST_NOISE = 0.05
 LEAST_LEARNING_RATE = 0.02  # at the end of a training, as a share of the first learning rate
 
 
 @dataclass(frozen=True)
 class Training:
-    """The settings of a training of the network."""
+    """Settings for the training of a recurrent network."""
 
     steps: int = 1000  # number of steps of the optimiser
     plants: int = 128  # number of plants in each step
@@ -61,7 +57,7 @@ class Training:
     hard_share: float = 0.6  # share of the plants that are like those of the preset `hard`
     nodes: int = 32  # number of nodes of the recurrent unit
     hidden: int = 24  # number of nodes of the hidden layer after the recurrent unit
-    learning_rate: float = 0.005  # of Adam at the first step; it falls linearly
+    learning_rate: float = 0.005  # learning rate of Adam at the first step; falls linearly
     largest_gradient: float = 0.3  # norm to which the gradient of a step is clipped
     averaging: float = 0.99  # factor per step of the exponential mean of the weights
     validation_episodes: int = 200  # number of episodes of the validation
@@ -86,20 +82,19 @@ class Net(nn.Module):
         self.cell = nn.GRUCell(INPUTS, nodes)
         self.hidden = nn.Linear(INPUTS + nodes, hidden)
         self.output = nn.Linear(hidden + INPUTS, OUTPUTS)
-        with torch.no_grad():  # small corrections, so that the law is nearly linear at first
+        with torch.no_grad():  # small corrections at first: nearly a linear control law
             self.output.weight.mul_(0.1)
             self.output.bias.zero_()
         self.state = torch.zeros(0, nodes)
 
     def begin(self, n: int) -> None:
-        """Set the state to 0 for n control loops at rest, before a new episode."""
+        """Set the network's state to 0 for n control loops, before a new episode."""
         self.state = torch.zeros(n, self.cell.hidden_size)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the corrections of the control law at a sample, and update `state`.
+        """Return the corrections of the control law, shape (n, OUTPUTS), and update `state`.
 
-        `inputs` are the inputs that `agents.law` computes, shape (n, INPUTS). The corrections
-        have the shape (n, OUTPUTS).
+        `inputs` are the network's inputs at a sample, from `agents.law`, shape (n, INPUTS).
         """
         self.state = self.cell(inputs, self.state)
         hidden = nn.functional.silu(self.hidden(torch.cat([inputs, self.state], dim=1)))
@@ -109,7 +104,8 @@ class Net(nn.Module):
     def export(self, **provenance: Any) -> RecurrentNetwork:
         """Return a copy of the network in NumPy.
 
-        `provenance` says how the network was trained, as values that JSON can store.
+        The keyword arguments `provenance` describe the training, with values that JSON can
+        store.
         """
         tensors = {
             "input_weights": self.cell.weight_ih,
@@ -126,61 +122,64 @@ class Net(nn.Module):
 
 
 class Loops:
-    """A batch of plants under the control law, simulated from rest in segments of samples.
+    """Control loops of n plants with the neural self-tuning controller, simulated from rest.
 
-    An observation is the set point and the output, divided by the authority of the plant: the
-    steady change of temperature, degC, that half the actuator's range causes.
+    The controller gets set points and outputs divided by the steady temperature change, degC,
+    that half the actuator's range causes in the plant.
 
     Parameters
     ----------
     plants
         The differentiable environment.
     batch
-        Plant numbers, set points and noise of an episode, and what controllers know of plants.
+        Parameter values, set points and noise of the plants in an episode, and what the
+        controllers know of the plants in advance.
     net
-        The network that corrects the control law.
+        Network that corrects the control law.
     seed
-        Seed of the environment, for random numbers that `batch` does not contain.
+        Seed of all random numbers that are not in `batch`, such as the measurement noise.
     """
 
     def __init__(self, plants: MiddlePointTorchEnv, batch: Batch, net: Net, seed: int) -> None:
         self._plants = plants
         self._net = net
-        self._authorities = batch.authorities
+        self._temperature_ranges = batch.temperature_ranges
         self._bank = Bank(batch.prior)
         # Flows are shares of half the actuator's range, so the limits are -1 and 1.
         largest_flow = np.ones_like(batch.edges)
         limits = -largest_flow, largest_flow
         self._observer = Observer(self._bank, batch.edges, limits, batch.random_setpoint)
-        self._law = Law(self._bank, batch.edges, limits, torch, torch.from_numpy)
+        self._control_law = Law(self._bank, batch.edges, limits, torch, torch.from_numpy)
         net.begin(self._bank.n)
         options = {"signals": batch.signals}
         self._observations, _ = plants.reset(seed=seed, options=options)
 
     def run(self, samples: int) -> tuple[Tensor, Tensor]:
-        """Simulate the next segment of `samples` samples, through which gradients can flow.
+        """Simulate the next `samples` samples of an episode, and return signals with gradients.
 
-        No gradient flows back into the segment before.
+        Backpropagation from the outputs ends where this call of `run` began.
 
         Returns
         -------
         outputs : Tensor
-            Outputs without noise of the transmitter, degC, shape (samples, n).
+            Outputs of the plants without measurement noise, degC, shape (samples, n).
         time_constant_factors : Tensor
-            Time constants at the end of the segment, as multiples of the paper's, shape (n,).
+            Time constants of the plants at the last sample, as multiples of the paper's time
+            constant, shape (n,).
         """
         self._plants.detach()
-        self._law.detach()
+        self._control_law.detach()
         self._net.state = self._net.state.detach()
         outputs = []
         for _ in range(samples):
-            scaled = self._observations.detach().numpy() / self._authorities[:, np.newaxis]
+            observations = self._observations.detach().numpy()
+            scaled = observations / self._temperature_ranges[:, np.newaxis]
             setpoints, measurements = scaled.T
-            situation = self._observer.observe(setpoints, measurements)
-            flows = self._law.flow(situation, self._net)  # from -1 to 1
+            estimates = self._observer.observe(setpoints, measurements)
+            flows = self._control_law.flow(estimates, self._net)  # from -1 to 1
             self._bank.apply(flows.detach().numpy())
-            # The law is made for a positive gain. The gain of the plants is negative, and the
-            # limits are symmetric.
+            # The control law is made for a positive gain, but the plants' gain is negative. The
+            # sign of the flow can be changed, because the limits of the flow are symmetric.
             actions = -flows[:, None]
             self._observations, _, _, _, infos = self._plants.step(actions)
             outputs.append(infos["output"])
@@ -188,21 +187,17 @@ class Loops:
 
 
 def noise_response(time_constant_factors: Tensor, samples: int) -> Tensor:
-    """Return the impulse response of C / A, from the noise xi to the output.
+    """Return the impulse response from the white noise xi to the output, shape (samples, n).
 
-    A and C are the polynomials of the plant, equation (28) of the paper.
+    The transfer function from xi to the output is C / A, with the polynomials A and C of
+    equation (28) of the paper.
 
     Parameters
     ----------
     time_constant_factors
-        Time constants of n plants, as multiples of the paper's, shape (n,).
+        Time constants of n plants, as multiples of the paper's time constant, shape (n,).
     samples
-        Length of the impulse response.
-
-    Returns
-    -------
-    Tensor
-        Shape (samples, n).
+        Number of samples of the impulse response.
     """
     pole = 1.0 - (1.0 - POLE) / time_constant_factors
     response: list[Tensor] = []
@@ -218,29 +213,29 @@ def noise_response(time_constant_factors: Tensor, samples: int) -> Tensor:
     return torch.stack(response)
 
 
-def chance_of_change(ages: Tensor, samples: Tensor) -> Tensor:
-    """Return the probability that a random set point changes within the next samples.
+def chance_of_change(setpoint_ages: Tensor, samples: Tensor) -> Tensor:
+    """Return the probability that a random set point changes within the next `samples` samples.
 
     Parameters
     ----------
-    ages
+    setpoint_ages
         Number of samples since the last change of the set point.
     samples
-        Number of future samples, in a shape that broadcasts with the shape of `ages`.
+        Number of future samples, in a shape that broadcasts with that of `setpoint_ages`.
     """
     shortest, longest = HOLD_TIMES
-    # A hold time is longer than `passed`, and all longer hold times are equally probable.
-    passed = ages.clamp(min=shortest - 1.0)
+    # All hold times from `passed` + 1 to `longest` samples are equally probable.
+    passed = setpoint_ages.clamp(min=shortest - 1.0)
     possible_hold_times = (longest - passed).clamp(min=1.0)
-    hold_times_that_end = (ages + samples).clamp(max=longest) - passed
+    hold_times_that_end = (setpoint_ages + samples).clamp(max=longest) - passed
     return (hold_times_that_end / possible_hold_times).clamp(0.0, 1.0)
 
 
 def mean_distance(distances: Tensor, deviations: Tensor) -> Tensor:
     """Return the mean of |x + z| for numbers x and normal random numbers z with the mean 0.
 
-    `distances` are the numbers x, and `deviations` the standard deviations of z. The shapes of
-    both broadcast.
+    `distances` are the numbers x, and `deviations` are the standard deviations of z, in shapes
+    that broadcast.
     """
     ratios = distances / deviations
     density = math.sqrt(2.0 / math.pi) * torch.exp(-0.5 * ratios.square())
@@ -248,17 +243,18 @@ def mean_distance(distances: Tensor, deviations: Tensor) -> Tensor:
 
 
 def filtered(innovations: Tensor, responses: Tensor) -> Tensor:
-    """Return white noise after a filter of finite impulse response, shape (samples, n).
+    """Return white noise, filtered by a finite impulse response, shape (samples, n).
 
     Parameters
     ----------
     innovations
-        The white noise of n plants, shape (samples + lags - 1, n). The first lags - 1 values
-        are those before the first result.
+        White noise of n plants, shape (samples + lags - 1, n). The first lags - 1 rows are from
+        the samples before the first row of the result.
     responses
-        The impulse response for each plant, shape (lags, n).
+        Impulse response for each plant, shape (lags, n).
     """
-    # `conv1d` multiplies without reversing the kernel. Each plant is a group of its own.
+    # `conv1d` computes a correlation, so the impulse responses are reversed. Each plant is a
+    # group of its own.
     kernels = responses.flip(0).T[:, None].contiguous()
     n = innovations.shape[1]
     return nn.functional.conv1d(innovations.T[None], kernels, groups=n)[0].T
@@ -269,36 +265,39 @@ def expected_error(
 ) -> Tensor:
     """Return the loss: the mean over samples and plants of the expected |e(k)|, degC.
 
-    The error e(k) is the set point minus the output y(k). The last command that affects y(k) is
-    the command of the sample k - d - 1, where d is the plant's delay. The expectation is that
-    of an observer at the sample k - d - 1. For the observer, the effect of later noise xi on
-    y(k) has a normal distribution, and the set point may change later to a level that is
-    uniformly distributed. Samples k up to d, which no command affects, do not count.
+    The control error e(k) is the set point minus the output y(k) at the sample k. The last
+    command that affects y(k) is the command of the sample k - d - 1, where d is the plant's
+    delay. The expected |e(k)| is the mean over everything that is random after the sample
+    k - d - 1: the effect of noise on y(k) has a normal distribution, and a random set point may
+    change to a level that is uniformly distributed. The loss leaves out the outputs y(k) with
+    k <= d, which no command affects.
 
     Parameters
     ----------
     outputs
-        The simulated outputs from k = `first` on, degC, shape (samples, n).
+        Simulated outputs from the sample k = `first` on, degC, shape (samples, n).
     batch
-        Plant numbers, set points and noise of the episode.
+        Parameter values, set points and noise of the plants in the episode.
     time_constant_factors
-        Present time constants, as multiples of the paper's, shape (n,).
+        Present time constants of the plants, as multiples of the paper's time constant, shape
+        (n,).
     first
-        The sample k of the first output.
+        Number k of the first sample in `outputs`.
     """
     samples, n = outputs.shape
     delays = batch.numbers["delay"]
     lags = int(delays.max()) + 1
     responses = noise_response(time_constant_factors, lags)
-    # Of each plant, only the d + 1 latest values of xi are later than the last command.
+    # Only the d + 1 latest values of xi are later than the last command that affects y(k).
     responses = responses * (torch.arange(lags)[:, None] <= delays)
+    # With `lags` zeros in front, the index i of `innovations` holds xi(i - lags).
     innovations = torch.cat([torch.zeros(lags, n), batch.innovations])
     noise = filtered(innovations[first + 1 : first + samples + lags], responses)
     expected_outputs = outputs - noise
     variances = batch.numbers["noise_variance"] * responses.square().sum(0)
     deviations = variances.sqrt().clamp(min=LEAST_NOISE)
 
-    # The sample of the last command that affects each output.
+    # For each output, the number of the sample with the last command that affects the output.
     decisions = torch.arange(first, first + samples)[:, None] - delays.long() - 1
     is_affected = decisions >= 0
     decisions = decisions.clamp(min=0)
@@ -308,15 +307,15 @@ def expected_error(
     amplitudes = batch.amplitudes
     squares = amplitudes.square() + expected_outputs.square() + deviations.square()
     if_changed = squares / (2.0 * amplitudes)
-    chances = chance_of_change(batch.ages.gather(0, decisions), delays + 1.0)
-    chances = chances * batch.changes_by_surprise
+    chances = chance_of_change(batch.setpoint_ages.gather(0, decisions), delays + 1.0)
+    chances = chances * batch.has_random_setpoint
     errors = (1.0 - chances) * if_kept + chances * if_changed
     # At the start of an episode, no command may affect any output yet.
     return (errors * is_affected).sum() / is_affected.sum().clamp(min=1)
 
 
 def validate(network: RecurrentNetwork, episodes: int) -> dict[str, float]:
-    """Return a network's "mean_error", degC, and "travel" (of the valve, t/h), in validation.
+    """Return the "mean_error", degC, and the valve "travel", t/h, of a network in validation.
 
     The network corrects the self-tuning controller on `episodes` validation episodes of the
     environment `MiddlePointHard-v0`.
@@ -329,14 +328,14 @@ def validate(network: RecurrentNetwork, episodes: int) -> dict[str, float]:
 
 
 def train(training: Training, seed: int) -> RecurrentNetwork:
-    """Train a network, and return the network with the results of its validation.
+    """Train a network, and return the network with validation results in `provenance`.
 
     Parameters
     ----------
     training
-        The settings of the training.
+        Settings of the training.
     seed
-        Seed of the initial weights, the plants, and their set points and noise.
+        Seed of the initial weights, the plants, the set points and the noise.
     """
     torch.set_num_threads(1)  # the network is too small for more
     with torch.random.fork_rng(devices=[]):
@@ -355,22 +354,22 @@ def train(training: Training, seed: int) -> RecurrentNetwork:
 
 
 def optimise(training: Training, net: Net, seed: int) -> Net:
-    """Train a network in place, and return a network with the running mean of its weights.
+    """Train `net` in place, and return a network with the running mean of `net`'s weights.
 
     Parameters
     ----------
     training
-        The settings of the training.
+        Settings of the training.
     net
         The untrained network.
     seed
-        Seed of the plants, and of their set points and noise.
+        Seed of the plants, the set points and the noise.
     """
     mean = copy.deepcopy(net)
     optimiser = torch.optim.Adam(net.parameters())
     sampler = Sampler(training.plants, training.hard_share, seed)
     plants = environment(training.plants)
-    segments = SAMPLES // training.segment  # of an episode
+    segments = SAMPLES // training.segment  # number of segments in an episode
     for step in range(training.steps):
         segment = step % segments
         if segment == 0:  # A new episode begins.

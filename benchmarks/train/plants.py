@@ -1,4 +1,4 @@
-"""Make random plants to train on, with set points, noise and a controller's prior knowledge."""
+"""Draw random plants for training, with set points, noise and the controllers' knowledge."""
 
 import math
 from dataclasses import dataclass
@@ -16,16 +16,18 @@ from mptc_gym.torch_env import MiddlePointTorchEnv
 
 SAMPLES: Final = 1200  # length of an episode
 PAPER: Final = Parameters()  # the paper's plant
-GAIN: Final = abs(sum(PAPER.b) / sum(PAPER.a))  # magnitude of its gain, degC per t/h
-POLE: Final = float(np.abs(np.roots(PAPER.a)).max())  # its pole of the dominant time constant
-# Half the range of its actuator, t/h.
+# Magnitude of the gain of the paper's plant, degC per t/h.
+GAIN: Final = abs(sum(PAPER.b) / sum(PAPER.a))
+# Pole of the paper's plant that belongs to the dominant time constant.
+POLE: Final = float(np.abs(np.roots(PAPER.a)).max())
+# Half the actuator's range in the paper's plant, t/h.
 HALF_RANGE: Final = (PAPER.range_of("u_max")[1] - PAPER.range_of("u_min")[0]) / 2.0
 HARD: Final = PRESETS["hard"]  # arguments of the environment `MiddlePointHard-v0`
 # Shortest and longest time for which a random set point of `hard` keeps a level, samples.
 HOLD_TIMES: Final = (100, 300)
 # A hold time that never ends, samples, for set points that do not change at random.
 UNCHANGED: Final = 1e30
-DELAYS: Final = 13  # number of delays in the bank of models of each plant
+DELAYS: Final = 13  # number of delays among the candidate models of each plant
 # Standard deviation of the logarithm of the time constant from an inexact step test.
 TIME_CONSTANT_SPREAD: Final = 0.35
 EXACT_GAIN_SPREAD: Final = 1e-3  # like `GAIN_SPREAD`, for the gain from an exact step test
@@ -33,8 +35,8 @@ EXACT_GAIN_SPREAD: Final = 1e-3  # like `GAIN_SPREAD`, for the gain from an exac
 DELAY_SPREAD: Final = 4.0
 # Logarithm of the probability of a model that an exact step test excludes, in effect 0.
 IMPROBABLE: Final = -200.0
-# Ranges of the environment's arguments that contain the numbers of all training plants. Every
-# episode sets the plant numbers within these ranges.
+# Ranges of the environment's arguments. The parameter values of all training plants, which are
+# new in every episode, are within these ranges.
 RANGES: Final[dict[str, Any]] = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),
@@ -52,39 +54,40 @@ RANGES: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Batch:
-    """An episode of n plants, and what the controllers know of the plants in advance."""
+    """Random plants for an episode, and what controllers know of the plants in advance."""
 
     numbers: dict[str, Tensor]
-    """The plant numbers by the names of the environment's arguments, each of shape (n,)."""
+    """Parameter values of the plants, by the environment's arguments, each of shape (n,)."""
     setpoints: Tensor
     """Set points at k = 0 to SAMPLES, degC, shape (SAMPLES + 1, n)."""
-    ages: Tensor
+    setpoint_ages: Tensor
     """Number of samples since the last change of the set point, shape (SAMPLES + 1, n)."""
     innovations: Tensor
-    """The white noise xi of equation (28) of the paper, degC, shape (SAMPLES + 1, n)."""
-    changes_by_surprise: Tensor
-    """Whether the set point of a plant changes at random, as in the preset `hard`, shape
+    """White noise xi of equation (28) of the paper, degC, shape (SAMPLES + 1, n)."""
+    has_random_setpoint: Tensor
+    """Whether the set point of a plant changes at random times, as in the preset `hard`, shape
     (n,)."""
     amplitudes: Tensor
     """Largest possible set point of each plant, degC, shape (n,)."""
     random_setpoint: RandomSetpoint
-    """The distribution of the set points that controllers know; its amplitudes are shares of
-    the authority."""
+    """Distribution of the set points, which the controllers know; the amplitudes are divided by
+    `temperature_ranges`."""
     prior: Prior
-    """The prior knowledge of the plants' dynamics, for the bank of models."""
-    authorities: np.ndarray[Any, np.dtype[np.float32]]
-    """Authority of each plant, degC, shape (n,): the steady change of temperature that half the
-    actuator's range causes in the step test."""
+    """Candidate models of the plants and the models' probabilities, which the controllers know
+    in advance."""
+    temperature_ranges: np.ndarray[Any, np.dtype[np.float32]]
+    """Steady temperature change that half the actuator's range causes in the step test of a
+    plant, degC, shape (n,)."""
     edges: np.ndarray[Any, np.dtype[np.float32]]
     """Greatest half width that the dead zone may have, as a share of half the actuator's range,
     shape (n,)."""
 
     @property
     def signals(self) -> dict[str, Tensor]:
-        """Plant numbers, set points and noise, as the option `signals` of the reset.
+        """Parameter values, set points and noise, for `reset(options={"signals": ...})`.
 
-        The noise, degC, is C xi: the white noise after the polynomial C of equation (28) of the
-        paper.
+        The noise, degC, is C xi, with the white noise xi and the polynomial C of equation (28)
+        of the paper.
         """
         noise = self.innovations.clone()
         for lag, coefficient in enumerate(PAPER.c[1:], start=1):
@@ -95,7 +98,7 @@ class Batch:
 def environment(n: int) -> MiddlePointTorchEnv:
     """Return a differentiable environment of n plants.
 
-    An observation of a plant is the set point and the measured output, degC.
+    The observation of a plant consists of the set point and the measured output, degC.
     """
     return MiddlePointTorchEnv(
         n,
@@ -109,22 +112,22 @@ def environment(n: int) -> MiddlePointTorchEnv:
 
 
 class Sampler:
-    """A generator of random batches of n plants for training.
+    """A generator of random training episodes, each with n plants.
 
-    A share of the plants is like the plants of the preset `hard`. Half of the other plants are
-    known by an exact step test, and the other half by a step test with errors. The set points
-    of all plants that are not like `hard` last longer than those of `hard`, and mostly
-    alternate between a positive and a negative value.
+    A share of the plants is like those of the preset `hard`. For half of the plants unlike
+    `hard`, controllers know the result of an exact step test, and for the other half the result
+    of a step test with errors. Set points of plants unlike `hard` change less often than in
+    `hard`, and mostly alternate between a positive and a negative value.
 
-    If random numbers were drawn in another order, a seed would no longer give the network that
-    was published with the seed.
+    The code must draw random numbers in an unchanged order, so that a training gives the
+    published network with the same seed.
 
     Parameters
     ----------
     n
-        Number of plants in a batch.
+        Number of plants in an episode.
     hard_share
-        Share of the plants that are like the plants of the preset `hard`.
+        Share of the plants, from 0 to 1, that are like those of the preset `hard`.
     seed
         Seed of all random numbers.
     """
@@ -136,14 +139,14 @@ class Sampler:
         self._generator.manual_seed(seed)
 
     def batch(self) -> Batch:
-        """Return a new random batch of n plants for an episode."""
-        # One random number decides of which of three kinds a plant is.
+        """Return n new random plants, with set points and noise for an episode."""
+        # A plant is like `hard`, or it has an inexact step test, or it has an exact step test.
         kinds = self._uniform(0.0, 1.0)
         is_hard = kinds < self._hard_share
         is_exact = kinds > (1.0 + self._hard_share) / 2.0
         numbers = self._plant_numbers(is_hard)
         amplitudes = self._amplitudes(numbers["gain_factor"], is_hard)
-        setpoints, ages = self._setpoints(amplitudes, is_hard)
+        setpoints, setpoint_ages = self._setpoints(amplitudes, is_hard)
         innovations = torch.randn(SAMPLES + 1, self._n, generator=self._generator)
         innovations *= numbers["noise_variance"].sqrt()
         innovations[0] = 0.0  # the plant begins at rest
@@ -153,44 +156,43 @@ class Sampler:
         )
         prior = self._prior(time_constant_factors, numbers["delay"], is_hard, is_exact)
         widest_zones = self._widest_dead_zones(numbers["dead_zone"], is_hard, is_exact)
-        authorities = (gain_factors * GAIN * HALF_RANGE).numpy()
+        temperature_ranges = (gain_factors * GAIN * HALF_RANGE).numpy()
         random_setpoint = RandomSetpoint(
             shortest=np.where(is_hard, HOLD_TIMES[0], 0.0),
             longest=np.where(is_hard, HOLD_TIMES[1], UNCHANGED),
-            amplitude=amplitudes.numpy() / authorities,
+            amplitude=amplitudes.numpy() / temperature_ranges,
         )
         return Batch(
             numbers=numbers,
             setpoints=setpoints,
-            ages=ages,
+            setpoint_ages=setpoint_ages,
             innovations=innovations,
-            changes_by_surprise=is_hard,
+            has_random_setpoint=is_hard,
             amplitudes=amplitudes,
             random_setpoint=random_setpoint,
             prior=prior,
-            authorities=authorities,
+            temperature_ranges=temperature_ranges,
             edges=(widest_zones / HALF_RANGE + CLEARANCE).numpy(),
         )
 
     def _uniform(self, low: Any, high: Any, *shape: int) -> Tensor:
         """Return random numbers that are uniformly distributed from `low` to `high`.
 
-        The shape is `shape`, or (n,) by default; `low` and `high` broadcast against it.
+        The result has the shape `shape` (default: (n,)), to which `low` and `high` broadcast.
         """
         uniform = torch.rand(*(shape or (self._n,)), generator=self._generator)
         values: Tensor = low + uniform * (high - low)
         return values
 
     def _true_for(self, share: float) -> Tensor:
-        """Return random bools, shape (n,), True with the probability `share`."""
+        """Return random bools, shape (n,), that are True with the probability `share`."""
         return self._uniform(0.0, 1.0) < share
 
     def _plant_numbers(self, is_hard: Tensor) -> dict[str, Tensor]:
-        """Return random delays, gains and other numbers of the plants, each of shape (n,).
+        """Return random parameter values of n plants, by argument name, each of shape (n,).
 
-        The keys are the names of the environment's arguments. `is_hard` says which plants are
-        like those of the preset `hard`, shape (n,). All other plants have numbers from wider
-        ranges.
+        Plants like those of the preset `hard` (`is_hard`) have values from the ranges in
+        `hard`, and all other plants have values from wider ranges.
         """
         is_noisy = self._true_for(0.65)
         has_load = self._true_for(0.5)
@@ -223,21 +225,21 @@ class Sampler:
         return numbers
 
     def _amplitudes(self, gain_factors: Tensor, is_hard: Tensor) -> Tensor:
-        """Return random largest set points, degC, that the plants can reach, shape (n,).
+        """Return a random amplitude of the set points of each plant, degC, shape (n,).
 
-        `gain_factors` are the gains as multiples of the paper's gain, and `is_hard` says which
-        plants are like those of the preset `hard`, both of shape (n,).
+        Plants like those of the preset `hard` (`is_hard`) have the amplitude of the paper. For
+        all other plants, the amplitude is within the temperature range of the plant, which is
+        in proportion to `gain_factors`, the gains as multiples of the paper's gain.
         """
         reachable = 0.95 * GAIN * HALF_RANGE * gain_factors
         amplitudes = torch.where(self._true_for(0.5), 5.0, self._uniform(1.0, 6.0))
         return torch.where(is_hard, PAPER.setpoint_amplitude, amplitudes.minimum(reachable))
 
     def _setpoints(self, amplitudes: Tensor, is_hard: Tensor) -> tuple[Tensor, Tensor]:
-        """Return random set points, degC, and the number of samples since their last change.
+        """Return random set points, degC, and the number of samples since the last change.
 
-        `amplitudes` are the largest set points, degC, and `is_hard` says which plants are like
-        those of the preset `hard`, both of shape (n,). Both results have the shape
-        (SAMPLES + 1, n).
+        Both results have the shape (SAMPLES + 1, n). `amplitudes` are the largest set points of
+        the plants, degC, shape (n,).
         """
         shortest_hard, longest_hard = HOLD_TIMES
         shortest_other = self._uniform(longest_hard + 10.0, 700.0)
@@ -260,30 +262,19 @@ class Sampler:
         # (n, SAMPLES + 1): `searchsorted` needs one sorted row for each plant.
         started = torch.searchsorted(starts.T.contiguous(), samples_of_plants, right=True)
         level_numbers = started.T - 1
-        ages = samples[:, None] - starts.gather(0, level_numbers)
-        return levels.gather(0, level_numbers), ages
+        setpoint_ages = samples[:, None] - starts.gather(0, level_numbers)
+        return levels.gather(0, level_numbers), setpoint_ages
 
     def _step_test(
         self, factors: Tensor, spread: float, is_hard: Tensor, is_exact: Tensor
     ) -> Tensor:
-        """Return the gains or the time constants that the step tests of the plants find.
+        """Return the gains or the time constants that step tests of n plants find, shape (n,).
 
-        Parameters
-        ----------
-        factors
-            The plants' gains or time constants, as multiples of the paper's, shape (n,).
-        spread
-            Standard deviation of the logarithm of the ratio of a found value to the true value.
-        is_hard
-            Whether a plant is like those of the preset `hard`, shape (n,). Then the step test
-            finds the middle of the range of `hard`.
-        is_exact
-            Whether the step test finds the true value, for plants unlike `hard`, shape (n,).
-
-        Returns
-        -------
-        Tensor
-            The found values, as multiples of the paper's, shape (n,).
+        The true values `factors`, and the found values, are multiples of the paper's gain or
+        time constant. For a plant like those of the preset `hard` (`is_hard`), a step test
+        finds the middle of the range in `hard`. For a plant unlike `hard`, a step test finds
+        the true value (`is_exact`) or a value with a random error. The logarithm of the found
+        value divided by the true value has the standard deviation `spread`.
         """
         middle = sum(HARD["gain_factor"]) / 2.0  # for the time constant, the range is equal
         normal = torch.randn(self._n, generator=self._generator).clamp(-2.0, 2.0)
@@ -293,23 +284,13 @@ class Sampler:
     def _prior(
         self, time_constant_factors: Tensor, delays: Tensor, is_hard: Tensor, is_exact: Tensor
     ) -> Prior:
-        """Return the models and their probabilities, from which the bank of each plant starts.
+        """Return the candidate models of each plant, and the models' initial probabilities.
 
-        A model is a pair of a delay and a time constant, of which each bank has `DELAYS` and
-        those of `TIME_CONSTANTS`. For a plant with an exact step test, the model of the step
-        test has the probability 1. For half of the plants that are not like the preset `hard`,
-        models with a wrong delay are less probable.
-
-        Parameters
-        ----------
-        time_constant_factors
-            Time constants of the step tests, as multiples of the paper's, shape (n,).
-        delays
-            The plants' delays, samples, shape (n,).
-        is_hard
-            Whether a plant is like those of the preset `hard`, shape (n,).
-        is_exact
-            Whether the step test of a plant is exact, shape (n,).
+        Each plant has one candidate model for each pair of a delay and a time constant. For a
+        plant with an exact step test (`is_exact`), the candidate model from the step test has
+        the probability 1. For half of the plants unlike the preset `hard` (`is_hard`), models
+        with a wrong delay are less probable. `time_constant_factors` are the time
+        constants from step tests, as multiples of the paper's time constant, shape (n,).
         """
         poles = 1.0 - (1.0 - POLE) / time_constant_factors
         time_constants = -1.0 / torch.log(poles)  # samples
@@ -338,12 +319,11 @@ class Sampler:
     def _widest_dead_zones(
         self, dead_zones: Tensor, is_hard: Tensor, is_exact: Tensor
     ) -> Tensor:
-        """Return the greatest half width that each dead zone may have, t/h, shape (n,).
+        """Return the half width of the dead zone that controllers assume for each plant, t/h.
 
-        Controllers know the greatest half width. With an exact step test (`is_exact`), it is
-        the half width of the plant's own dead zone, `dead_zones`. For plants like those of the
-        preset `hard` (`is_hard`), it is the greatest half width in `hard`. All arguments have
-        the shape (n,).
+        After an exact step test (`is_exact`), controllers assume the true half width. For
+        plants like those of the preset `hard` (`is_hard`), controllers assume the greatest half
+        width in `hard`. For all other plants, the half width is up to 3 t/h too large.
         """
         margins = self._uniform(0.0, 3.0) * ~is_exact
         widest = (dead_zones + margins).clamp(max=8.0)

@@ -1,9 +1,8 @@
-"""Train PPO of Stable-Baselines3 on many plants at once, and export its policy to NumPy.
+"""Train policies by PPO of Stable-Baselines3 on many plants, and export the policies to NumPy.
 
-`RECIPES` has a recipe `ppo` for the paper's plant, and a recipe `ppo-hard` for plants that
-differ between episodes. Both recipes use the training of `benchmarks/examples/sb3.py`, where
-the reasons for its success are explained. This module adds training on plants of several kinds,
-observations with a longer past, and the validation of trained policies.
+The dict `RECIPES` has a recipe `ppo` for the paper's plant, and a recipe `ppo-hard` for plants
+that differ between episodes. The module `benchmarks/examples/sb3.py` has the training itself,
+and explains why the training succeeds.
 """
 
 import time
@@ -46,19 +45,19 @@ class TrainingPlants(NamedTuple):
     """Training plants of one kind."""
 
     number: int  # number of plants
-    arguments: Mapping[str, Any]  # their arguments of the environment
+    arguments: Mapping[str, Any]  # arguments of the environment for these plants
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """The settings of a training of a policy by PPO."""
+    """Settings for the training of a policy by PPO."""
 
     plants: tuple[TrainingPlants, ...]  # the kinds of training plants
     # Arguments of the environment for each case of the validation, by name. No published result
     # uses these cases.
     cases: Mapping[str, Mapping[str, Any]]
     # Half width of the dead zone that is compensated between policy and plant, t/h; 0 for no
-    # compensation. If it is above 0, a comparison sets it to the dead zone of the plant.
+    # compensation. A comparison replaces a half width above 0 by that of the plant.
     dead_zone: float
     # Whether the policy's inputs include the set point and the flow, in addition to the error
     # and to changes of set point, temperature and flow.
@@ -124,11 +123,11 @@ RECIPES = {
 
 
 def for_plant(plant: Mapping[str, Any]) -> Recipe:
-    """Return the recipe `ppo`, adapted to a plant that is not the paper's.
+    """Return the recipe `ppo`, adapted to a plant that differs from the paper's plant.
 
-    Set points, errors and temperatures are scaled in proportion to `setpoint_amplitude`. If the
-    plant has no noise, most training plants get noise in proportion to the largest temperature
-    that the flow can cause.
+    Set points, errors and temperatures are scaled in proportion to the argument
+    `setpoint_amplitude`. If the plant has no noise, most training plants get noise in
+    proportion to the largest temperature change that the flow can cause.
 
     Parameters
     ----------
@@ -171,19 +170,17 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
 
 
 def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> PolicyNetwork:
-    """Train a policy, and return the policy with the results of its validation.
-
-    The validation is part of the policy's `provenance`.
+    """Train a policy, and return the policy with validation results in `provenance`.
 
     Parameters
     ----------
     recipe
-        The settings of the training.
+        Settings of the training.
     seed
         Seed of the initial weights, the exploration and the plants.
     plant
-        Arguments of the environment for the plant, if `for_plant` has made the recipe. None if
-        the recipe is one of `RECIPES`.
+        Arguments of the environment from which `for_plant` has made the recipe; None for a
+        recipe from `RECIPES`.
     """
     began = time.process_time()
     model = begin(recipe, seed)
@@ -212,7 +209,7 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
 
 
 def begin(recipe: Recipe, seed: int) -> PPO:
-    """Return an untrained model of Stable-Baselines3 for a recipe.
+    """Return an untrained PPO model of Stable-Baselines3 with the settings in `recipe`.
 
     `seed` is the seed of the initial weights, the exploration and the plants.
     """
@@ -222,16 +219,16 @@ def begin(recipe: Recipe, seed: int) -> PPO:
 
 
 class Plants(GymnasiumVecEnv):
-    """The training plants of a recipe, as a vector environment of Stable-Baselines3.
+    """The training plants of `recipe`, as a vector environment of Stable-Baselines3.
 
-    The plants of a group have the same seed, and so the same plant numbers, noise and set
-    points. An observation holds the inputs of the policy, which `features` computes from the
-    environment's longer observation.
+    Each group of `GROUP` successive plants has one seed, so all plants of the group have the
+    same parameter values, noise and set points. The observations are the inputs of the policy:
+    the matrix from `features`, multiplied by the observations of `MiddlePoint-v0`.
 
     Parameters
     ----------
     recipe
-        The settings of the training, which name the plants and the observation.
+        Settings of the training, with the arguments of the plants.
     """
 
     def __init__(self, recipe: Recipe) -> None:
@@ -256,20 +253,21 @@ class Plants(GymnasiumVecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set and return the seeds of the plants for the next reset.
 
-        The seeds follow from `seed`, and no comparison of controllers uses them.
+        The seeds of the plants are computed from `seed`, in a range of seeds that no comparison
+        of controllers uses.
         """
         offset = int(np.random.SeedSequence(seed).generate_state(1)[0])  # below 2**32
         return super().seed(TRAINING_SEEDS + offset)
 
     def reset(self) -> NDArray[Any]:
-        """Reset all plants, and return their observations, shape (plants, inputs)."""
+        """Reset all plants, and return the policy's inputs, shape (plants, inputs)."""
         return super().reset() @ self._features
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all plants by the actions of `step_async`, as a `VecEnv` does.
 
-        The returned observations, and the last observations of ended episodes in the infos, are
-        the policy's inputs.
+        The returned observations, and the items "terminal_observation" of the infos, are inputs
+        of the policy.
         """
         observations, rewards, ended, infos = super().step_wait()
         for i in np.flatnonzero(ended).tolist():
@@ -281,10 +279,11 @@ class Plants(GymnasiumVecEnv):
 def features(recipe: Recipe) -> Array:
     """Return the matrix that converts an observation to the inputs of the policy.
 
-    The shape is (inputs, size of the observation). The inputs are the error and the changes of
-    set point, temperature and flow and, with `recipe.levels`, the set point and the flow.
+    The matrix has the shape (number of inputs, length of an observation). The inputs of the
+    policy are the control error; the changes of set point, temperature and flow; and, with
+    `recipe.levels`, the set point and the flow.
     """
-    # The inputs are linear in the observation. So row i of the transposed matrix is the inputs
+    # The inputs are linear in the observation. So row i of the transposed matrix has the inputs
     # for an observation that is 1 at the element i and 0 elsewhere.
     observations = torch.eye(sum(recipe.windows.values()), dtype=torch.float64)
     # The last elements are the past flows; all elements before them are temperatures.
@@ -300,8 +299,8 @@ def features(recipe: Recipe) -> Array:
 def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
     """Return a trained policy, without exploration, as a network in NumPy.
 
-    The conversion of observations to inputs becomes part of the first layer. `model` was
-    trained with `recipe`.
+    The matrix `features(recipe)` becomes part of the first layer, so the input of the network
+    is an observation of `MiddlePoint-v0`. `model` was trained with `recipe`.
     """
     layers = []
     for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net):
