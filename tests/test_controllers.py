@@ -133,7 +133,7 @@ class TestOwnControllers:
             ("raise SystemExit(3)", "--agent: .* cannot be loaded: SystemExit: 3"),
             ("class Mine: pass", "policy must be a function, .*, or an object with pre"),
             ("class Mine: observation = 3", "cannot be loaded: .* a dict .* got 3"),
-            ("class Mine: observation = {'delay': 0}", "out of .* got {'delay': 0}"),
+            ("class Mine: observation = {'delay': 0}", "with keys from .* got {'delay': 0}"),
             (
                 "class Mine: reset = dict; act = lambda self, o: 0.0",
                 r"policy must return finite actions, shape \(2, 1\), got .*, shape \(\)",
