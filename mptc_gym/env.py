@@ -45,7 +45,8 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
     if isinstance(setpoints, str):
         setpoints = parameters.setpoint_amplitude
     setpoint_limit = max(span, np.abs(setpoints).max())
-    # The largest magnitude of a set point, of an error, of an output and of an action.
+    # The largest magnitudes of a set point, an error, an output and an action in an
+    # observation.
     limits = np.array([setpoint_limit, setpoint_limit + span, span, 1.0], np.float32)
     high = np.repeat(limits, parameters.windows)
     return Box(-high, high, dtype=np.float32)
@@ -97,7 +98,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     flow u(k), moves the plant from sample k to k+1, and returns the observation at k+1 and the
     reward of the error e(k+1). With a delay of d = 18 samples, y(19) is the first temperature
     that depends on the flow u(0). With polynomials A, B and C in the backward shift z^-1,
-    equation (28) reads A(z^-1) y(k) = B(z^-1) u_a(k-d) + C(z^-1) xi(k).
+    equation (28) reads A(z^-1) y(k) = B(z^-1) u_a(k-d) + C(z^-1) xi(k), for temperature y,
+    applied flow u_a, delay d and white noise xi.
 
     Section 1 of the paper names difficulties of a boiler that equation (28) does not include.
     The environment can simulate the following difficulties, which are off by default, and on in
@@ -108,23 +110,24 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
       measurement_noise_variance). The reward and `info["output"]` use the true temperature y.
 
     - A load disturbance w (degC), as when the feedwater's temperature, the coal or the fire's
-      position changes: A(1) w(k) is added to the right side of equation (28), so that a
-      constant load w adds w to the steady-state temperature. The load w starts at 0 and changes
-      every 10 samples. The load w is the sum of a random walk and of a level that jumps. The
-      variance of the random walk grows by `disturbance_walk_variance` per sample. The level of
-      the load jumps at random times, every `disturbance_interval` samples on average, to a new
+      position changes: A(1) w(k), where A(1) is the sum of the coefficients of the polynomial
+      A, is added to the right side of equation (28), so that a constant load w adds w to the
+      steady-state temperature. The load w starts at 0 and changes every 10 samples. The load
+      disturbance w is the sum of a random walk and of a level that jumps. The variance of the
+      random walk in the load grows by `disturbance_walk_variance` per sample. The level of the
+      load jumps at random times, every `disturbance_interval` samples on average, to a new
       level that is uniform within +-`disturbance_amplitude`.
 
     - Other dynamics: `gain_factor` multiplies the steady-state gain, and `time_constant_factor`
-      multiplies the dominant time constant. The polynomial A is (1 - p z^-1) Q(z^-1), where
-      p = 0.9515 is the slowest pole of equation (28), and the dominant time constant is
-      1 / (1 - p) = 20.6 samples. A gain factor g and a time constant factor t replace the
-      slowest pole p by 1 - (1 - p) / t, multiply the polynomial B by g / t, and leave the
-      polynomial Q unchanged.
+      multiplies the dominant time constant. The slowest pole of equation (28) is p = 0.9515,
+      and the dominant time constant is 1 / (1 - p) = 20.6 samples. A gain factor g and a time
+      constant factor t replace the slowest pole p of equation (28) by 1 - (1 - p) / t, multiply
+      the polynomial B by g / t, and leave the other poles unchanged.
 
-    - Fouling: within `drift_samples` samples, the gain drifts linearly to `gain_drift` times
-      the gain at k = 0, and the time constant to `time_constant_drift` times the time constant
-      at k = 0. A drifting gain or time constant changes every 10 samples.
+    - Fouling: within the first `drift_samples` samples of an episode, the steady-state gain
+      drifts linearly to `gain_drift` times the gain at k = 0, and the time constant to
+      `time_constant_drift` times the time constant at k = 0. A gain or time constant that
+      drifts changes in small steps, every 10 samples.
 
     ## Action space
 
@@ -141,9 +144,9 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     ## Observation space
 
     The observation is a 1-D float32 array that joins four blocks: set points, errors, outputs
-    and past actions, each block with the newest sample first. In the table of the four blocks,
-    y is the transmitter's reading of the temperature, which saturates at +-`temperature_span`,
-    and e is y_d minus this reading.
+    and past actions, each block with the newest sample first. In the following table of the
+    blocks of an observation, y is the transmitter's reading of the temperature, which saturates
+    at +-`temperature_span`, and e is y_d minus this reading.
 
     | Block | Elements (default) | Bounds (default) | Unit |
     |---|---|---|---|
@@ -202,9 +205,10 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
 
     `reset` and `step` return a new dict of floats: `output` (the true y, degC), `setpoint`
     (y_d, degC), `error` (y_d - y, degC), `command` (u, t/h), `applied` (u_a, t/h) and `noise`
-    (n, degC). The info of the step from sample k to k+1 holds the flows u(k) and u_a(k), and
-    y(k+1), y_d(k+1), e(k+1) and n(k+1). In the info of `reset`, `command`, `applied` and
-    `noise` are 0.
+    (n, degC). The info of the step from sample k to k+1 holds the commanded flow u(k), the
+    applied flow u_a(k), the temperature y(k+1), the set point y_d(k+1), the error e(k+1) and
+    the noise n(k+1). In the info of `reset`, the entries `command`, `applied` and `noise` are
+    0.
 
     With a load disturbance, the info also holds `disturbance`, the load w in degC. With a drift
     of gain or time constant, the info also holds the values of `gain_factor` and
@@ -290,7 +294,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
             The observation at sample k = 0, shape (size,); the docstring of the class describes
             the elements.
         info : dict of float
-            The info at sample k = 0, with the numbers that `reset` sampled from ranges.
+            The info at sample k = 0, with the values that `reset` sampled for arguments that
+            are ranges.
         """
         super().reset(seed=seed)
         if self._root is not self.np_random:  # at the first reset, or after a new seed
@@ -364,8 +369,9 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
             if not math.isfinite(a):
                 one_action(a)  # raises a ValueError, as the action is not finite
         if not self._coming_signals:
-            if not self._streams:
+            if not self._streams:  # random number streams, which the first reset makes
                 raise ResetNeeded("call reset before step")
+            # In reverse order, because `pop` returns the last element of the list.
             self._coming_signals = self._signals.ahead()[::-1]
         setpoint, noise, load, measurement_noise = self._coming_signals.pop()
 

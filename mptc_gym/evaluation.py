@@ -51,7 +51,7 @@ class Evaluation:
     env : str
         Id of the environment, or the class name of an environment that has no id.
     mean_error, travel : float
-        Mean of the attribute `errors`, degC, and mean of the attribute `travels`, t/h.
+        Mean absolute error, degC, and valve travel, t/h, each averaged over the episodes.
     errors : ndarray, shape (episodes,)
         Mean absolute error of each episode, degC: the mean of |e(k)| over the samples k = 1 to
         N, where e(k) is the deviation of the temperature from the set point.
@@ -63,11 +63,13 @@ class Evaluation:
     note : str
         Reason why the score is missing or why the valve never moved, with advice; otherwise "".
     least_possible : float or None
-        Least mean error that any controller can have on the episodes, degC. If the package does
-        not know the least possible error, `least_possible` and all following attributes are
-        None, and `note` says why.
+        Least possible mean error, degC, averaged over the episodes: a lower bound for random
+        and constant set points, otherwise the lowest mean error if set-point changes come as a
+        surprise. If the package does not know the least possible error, the attributes
+        `least_possible`, `multiple`, `score`, `interval`, `least` and `scores` are None, and
+        the attribute `note` says why.
     multiple : float or None
-        `mean_error / least_possible`.
+        The mean error of the policy divided by the least possible mean error.
     score : float or None
         Score of the policy: 0 for the mean error of a valve that never moves, 1 for the least
         possible mean error.
@@ -75,8 +77,8 @@ class Evaluation:
         95 % confidence interval of the score, from a bootstrap that resamples episodes.
     least, scores : ndarray or None, shape (episodes,)
         Least possible mean error of each episode, degC, and score of each episode. If nothing
-        but noise and load is random in the environment, `least` holds the same expected value
-        for all episodes.
+        but noise and load is random in the environment, the least possible mean error is an
+        expected value, the same for all episodes.
     """
 
     env: str
@@ -176,11 +178,11 @@ def evaluate(
     Raises
     ------
     ValueError
-        If `env` does not exist, is no environment of this package, or runs episodes of other
-        seeds. If the policy does not fit `env`, or returns actions of the wrong shape. If the
-        policy is a model of Stable-Baselines3 with training environments, and `env` has other
-        observation windows or wrappers. If `env` is the training environment of the policy and
-        cannot be copied.
+        If `env` does not exist, is no environment of this package, or does not run the episodes
+        that belong to the seeds. If the policy does not fit `env`, or returns actions of the
+        wrong shape. If the policy is a model of Stable-Baselines3 with training environments,
+        and `env` has other observation windows or wrappers. If `env` is the training
+        environment of the policy and cannot be copied.
 
     Examples
     --------
@@ -335,9 +337,10 @@ def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
 def _read_bounds() -> dict[Parameters, dict[int, Values]]:
     """Return the least possible mean errors in the file `bounds.json`, degC.
 
-    The keys of the outer dict are plant arguments, in the form that `case_of` returns. Each
-    inner dict maps the seed of a first episode to an array of the least possible mean errors
-    for successive seeds. An array with a single element is valid for all seeds.
+    The keys of the returned dict are plant arguments, in the form that `case_of` returns. The
+    values of the returned dict are dicts, which map the seed of a first episode to an array of
+    the least possible mean errors for successive seeds. If such an array has a single element,
+    the least possible mean error is the same for all seeds.
     """
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
     bounds = {}
@@ -350,7 +353,7 @@ def _read_bounds() -> dict[Parameters, dict[int, Values]]:
 
 
 def case_of(parameters: Parameters) -> Parameters:
-    """Return plant arguments, with defaults for observation windows and rewards.
+    """Return `parameters` with the default observation windows and the default reward.
 
     Plants for which `case_of` returns equal arguments have the same least possible error.
     """
@@ -369,7 +372,7 @@ def _idle_errors(parameters: Parameters, seeds: range) -> Values:
 
 
 def _with_scores(evaluation: Evaluation, least: Values, idle_errors: Values) -> Evaluation:
-    """Return a copy of an evaluation with the fields that need the least possible errors."""
+    """Return a copy of `evaluation` with the least possible errors and the scores."""
     gained = idle_errors - evaluation.errors
     possible = idle_errors - least
     n = len(gained)

@@ -1,4 +1,4 @@
-"""Define presets of the environment's arguments: the paper's 3 cases and 4 harder ones."""
+"""Define presets of the environment's arguments: the paper's 3 cases and 4 harder cases."""
 
 from typing import Any, Final
 

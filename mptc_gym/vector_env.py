@@ -45,12 +45,12 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     max_episode_steps
         Number of samples after which an episode is truncated; None or -1 for no limit.
     autoreset_mode
-        An `AutoresetMode` or the value of an `AutoresetMode`, as a string. "NextStep": the step
-        after the end of an episode resets the plant, and ignores the action for this plant.
-        "SameStep": the step that ends an episode also resets the plant; `final_obs` and
-        `final_info` in the infos hold the last observation and info of the episode. "Disabled":
-        the caller resets each plant whose episode has ended, with `reset(options={"reset_mask":
-        mask})`.
+        When to reset a plant whose episode has ended: an `AutoresetMode` of Gymnasium, or the
+        value of an `AutoresetMode`, as a string. "NextStep": the step after the end of an
+        episode resets the plant, and ignores the action for this plant. "SameStep": the step
+        that ends an episode also resets the plant; `final_obs` and `final_info` in the infos
+        hold the last observation and info of the episode. "Disabled": the caller resets each
+        plant whose episode has ended, with `reset(options={"reset_mask": mask})`.
     render_mode
         Render mode: None, or "rgb_array", with which `render` returns one picture per plant.
     **arguments
@@ -297,8 +297,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _checked_seeds(self, seed: Any) -> Sequence[Any]:
         """Return a seed for each plant: an integer, or None for no new seed.
 
-        `seed` is None, an integer, or a list with an integer or None for each plant. From an
-        integer, plant i gets the seed `seed` + i. Any other value of `seed` raises a
+        `seed` is None, an integer, or a list with an integer or None for each plant. If `seed`
+        is an integer, plant i gets the seed `seed` + i. Any other value of `seed` raises a
         ValueError.
         """
         n = self.num_envs
@@ -326,9 +326,9 @@ class _Window:
     past actions in an observation.
 
     One 1-D array holds the observations of all plants, one observation after the other. At each
-    step, the index at which the first observation begins decreases by 1. Without any copying,
-    each old sample then lies one element later in the observation of its plant, and the new
-    sample replaces the first element of each block.
+    step, the index in this array at which the first observation begins decreases by 1. Without
+    any copying, each old sample then lies one element later in the observation of its plant,
+    and the new sample replaces the first element of each block.
     """
 
     def __init__(self, windows: Sequence[int], num_envs: int) -> None:
@@ -373,7 +373,7 @@ class _Window:
     def add(
         self, setpoint: Values, error: Values, output: Values, action: Values
     ) -> Observations:
-        """Add a sample of all plants, and return a copy of the observations, shape (n, size).
+        """Add a sample of each plant to the observations, and return a copy, shape (n, size).
 
         The sample consists of set points y_d(k+1), observed errors and outputs, all in degC,
         and normalised actions a(k), each of shape (n,).

@@ -1,8 +1,8 @@
 """Define the base class of the vector environments in NumPy and PyTorch.
 
-`BatchEnv` handles arguments, resets, time limits and infos. `MiddlePointVectorEnv` implements
-the plants with NumPy, and `MiddlePointTorchEnv` with PyTorch. A mask is a bool array, shape
-(num_envs,), which is True for the selected plants.
+`BatchEnv` handles the arguments, resets, time limits and infos of a vector environment.
+`MiddlePointVectorEnv` implements the plants with NumPy, and `MiddlePointTorchEnv` with PyTorch.
+A mask is a bool array, shape (num_envs,), which is True for the selected plants.
 """
 
 from __future__ import annotations
@@ -120,12 +120,13 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         Returns
         -------
         observations : array
-            The observations, shape (num_envs, size). For a plant that is not reset, the row
-            holds the plant's last observation.
+            The observations, shape (num_envs, size). For a plant that is not reset, the row of
+            the plant holds the plant's last observation.
         infos : dict
-            Infos by name, and the mask of the info `name` under `_name`, in arrays of shape
-            (num_envs,). The masks are False for plants that are not reset. Several infos may
-            share one array as their mask.
+            Infos by name, in arrays of shape (num_envs,). For each info `name`, the entry
+            `_name` is a mask, a bool array that is True for the plants that have this info. The
+            masks of infos are False for plants that are not reset. Several infos may share one
+            array as their mask.
 
         Raises
         ------
@@ -162,8 +163,9 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             were truncated, each of shape (num_envs,). No episode terminates; the time limit
             truncates episodes.
         infos : dict
-            Infos at sample k+1 by name, and the mask of the info `name` under `_name`, in
-            arrays of shape (num_envs,). Several infos may share one array as their mask.
+            Infos at sample k+1 by name, in arrays of shape (num_envs,). For each info `name`,
+            the entry `_name` is a mask, a bool array that is True for the plants that have this
+            info. Several infos may share one array as their mask.
 
         Raises
         ------
@@ -252,8 +254,8 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         -------
         PlantState
             Delay (samples), dead zone (t/h), gain (degC per t/h), time constant (s) and load
-            (degC), each of shape (num_envs,). Gain and time constant include the drift up to
-            the present sample.
+            (degC), each of shape (num_envs,). The returned gain and time constant include the
+            drift up to the present sample.
 
         Raises
         ------
@@ -301,7 +303,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             Values that were drawn for arguments that are ranges, by the name of the argument,
             shape (num_envs,).
         load : array
-            Loads w at the present sample, degC, shape (num_envs,).
+            Load disturbance w of each plant at the present sample, degC, shape (num_envs,).
         """
 
     @abstractmethod

@@ -115,8 +115,8 @@ class Panel:
     def shade(self, colour: Colour, first: int, last: int, low: float, high: float) -> None:
         """Shade the panel from sample `first` to `last`, and from the value `low` to `high`.
 
-        `low` and `high` have the unit of the vertical axis, degC or t/h. Multiplying the
-        colours of the picture by `colour` keeps lines under the shading visible.
+        `low` and `high` have the unit of the vertical axis, degC or t/h. The colours of the
+        picture are multiplied by `colour`, so that lines under the shading remain visible.
         """
         left = max(self._rectangle.left, round(self.x(first)))
         right = round(self.x(last))

@@ -67,8 +67,8 @@ def runs_processes(layer: Any) -> bool:
 def normaliser_flag(layer: Any) -> str:
     """Return the name of the attribute that enables the updates of a normalising wrapper.
 
-    The name is "" if `layer` does not normalise observations or rewards by
-    running statistics.
+    The returned name is "" if `layer` does not normalise observations or rewards by running
+    statistics.
     """
     if isinstance(layer, loaded(f"{VEC_ENV}.VecNormalize")):
         return "training"
@@ -108,8 +108,8 @@ def plant_groups(env: Any, outer: tuple[str, ...] = ()) -> list[PlantGroup]:
     -------
     list of PlantGroup
         One `PlantGroup` for each environment or batch of plants, in the order of the plants.
-        The list is empty if `env` holds no plants of this package in NumPy, or if the worker
-        processes of `env` are closed.
+        The returned list is empty if `env` holds no plants of this package in NumPy, or if the
+        worker processes of `env` are closed.
     """
     wrappers = outer
     if _changes_policy(env):
@@ -146,7 +146,8 @@ def ask_processes(env: Any, method: str, *arguments: Any) -> list[Any]:
     """Call a method of the environment in each worker process, and return the results.
 
     `env` is an `AsyncVectorEnv` of Gymnasium or a `SubprocVecEnv` of Stable-Baselines3. A
-    worker process ends if its environment lacks the method, or if the result cannot be pickled.
+    worker process ends if the environment in the process lacks the method `method`, or if the
+    result of the method cannot be pickled.
     """
     call_each = getattr(env, "env_method", None) or env.call
     return list(call_each(method, *arguments))
@@ -155,8 +156,9 @@ def ask_processes(env: Any, method: str, *arguments: Any) -> list[Any]:
 def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
     """Return descriptions of the plants in the worker processes of a vector environment.
 
-    `outer` holds the class names of the wrappers around `env`, the outermost first. The list is
-    empty if the worker processes are closed, or if an environment is from another package.
+    `outer` holds the class names of the wrappers around `env`, the outermost first. The
+    returned list is empty if the worker processes are closed, or if an environment is from
+    another package.
     """
     try:
         texts = ask_processes(env, "__str__")

@@ -56,9 +56,9 @@ def make_batch(single: Env, n: int, **modes: Any) -> Any:
     Returns
     -------
     VectorEnv or None
-        A `MiddlePointVectorEnv` with the wrappers of `single`. None if `single` is not a
-        `MiddlePointEnv`, or if `single` has a wrapper other than `IncrementalAction` and the
-        wrappers of `gymnasium.make`.
+        A `MiddlePointVectorEnv` with n plants, with the arguments and the wrappers of `single`.
+        None if `single` is not a `MiddlePointEnv`, or if `single` has a wrapper other than
+        `IncrementalAction` and the wrappers of `gymnasium.make`.
     """
     spec = single.spec
     plant = single.unwrapped

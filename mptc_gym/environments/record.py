@@ -35,10 +35,10 @@ class Record:
     span : int
         Number of samples between the left edge and the right edge of a picture.
     flow_axis : tuple of float
-        Lower end and upper end of the flow axis, t/h. The axis includes the actuator's limits
-        and 0, with a margin of 12 % at each end.
+        Lower end and upper end of the flow axis, t/h. The flow axis includes the actuator's
+        limits and 0, with a margin of 12 % at each end.
     samples : deque of Sample
-        Latest samples of the episode, at most `span` + 1, the newest last.
+        Latest samples of the episode, as many as a picture shows, the newest last.
     k : int
         Sample number of the newest sample.
     first : int
@@ -50,7 +50,7 @@ class Record:
     ) -> None:
         """Begin the record at sample k = 0, with the set point `setpoint`, degC.
 
-        Temperature and flows are 0 at k = 0.
+        At sample k = 0, temperature and flows are 0.
         """
         self.plant = plant
         self.sampling_interval = sampling_interval
@@ -68,7 +68,7 @@ class Record:
         self._highest = max(0.0, setpoint)
 
     def add(self, setpoint: float, output: float, command: float, applied: float) -> None:
-        """Add the results of the step from sample k to sample k+1.
+        """Append the signals of the step from sample k to sample k+1 to the record.
 
         Parameters
         ----------
@@ -87,6 +87,6 @@ class Record:
 
     @property
     def temperature_axis(self) -> tuple[float, float]:
-        """Ends of the temperature axis, degC: the episode's extremes, with a margin."""
+        """Lower and upper end of the temperature axis, degC, for all samples of the episode."""
         margin = max(0.05 * (self._highest - self._lowest), 0.5)
         return self._lowest - margin, self._highest + margin

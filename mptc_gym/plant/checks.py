@@ -177,8 +177,8 @@ def numbers(
 ) -> tuple[float, ...]:
     """Return an argument's value, a list or tuple of 1 to `most` numbers, as a tuple of floats.
 
-    A ValueError with the text `allowed` is raised unless `value` is a list or tuple of 1 to
-    `most` numbers within +-1e9.
+    A ValueError, whose message contains the text `allowed`, is raised unless `value` is a list
+    or tuple of 1 to `most` numbers within +-1e9.
     """
     if not isinstance(value, list | tuple) or not 0 < len(value) <= most:
         reject(name, value, allowed)
@@ -211,7 +211,7 @@ reward = partial(one_of, choices=REWARDS)
 
 
 def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
-    """Return the argument `setpoint`: one of `SETPOINTS`, a float, or a tuple of floats.
+    """Return the set point: "square", "random", a float, or a tuple of floats.
 
     A float is a constant set point, in degC. A tuple holds a set point for each sample, in
     degC. A ValueError is raised if `value` is not a valid set point.

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from mptc_gym.plant.parameters import Parameters, PlantNumbers, slowest_pole
 
 Values = NDArray[np.float64]  # one element per plant, shape (n,)
-# In NumPy arithmetic, an array of one element is faster than a Python number.
-_ZERO = np.array(0.0)
-_ONE = np.array(1.0)
+# In NumPy arithmetic, an array of shape () is faster than a Python number.
+_ARRAY_OF_0 = np.array(0.0)
+_ARRAY_OF_1 = np.array(1.0)
 # Number of samples between two changes of a drifting gain or time constant: drifts are slow,
 # and computing a change takes time.
 DRIFT_INTERVAL: Final = 10
@@ -59,8 +59,8 @@ def least_effective_command(
         Limits of the actuator, t/h.
     rounding
         Upper bound of the accumulated rounding error, divided by u_max - u_min + |u_max| +
-        |u_min|. The default, 2^-50, is enough for 8 float64 operations with a relative rounding
-        error of 2^-53 each.
+        |u_min|. The default bound, 2^-50, is enough for 8 float64 operations with a relative
+        rounding error of 2^-53 each.
     """
     return dead_zone - rounding * (u_max - u_min + abs(u_max) + abs(u_min))
 
@@ -103,16 +103,20 @@ class Dynamics:
     """The coefficients of the plant for a given steady-state gain and time constant.
 
     The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k),
-    with temperature y, applied flow u_a, delay d and white noise xi. The polynomial A is
-    (1 - p z^-1) Q(z^-1), where p is the slowest pole and Q holds the other poles.
+    with temperature y, applied flow u_a, delay d and white noise xi. The polynomial A is the
+    product of 1 - p z^-1, where p is the slowest pole, and of a polynomial Q with the other
+    poles.
 
-    A gain factor g makes the steady-state gain g B(1) / A(1). A time constant factor t makes
-    the dominant time constant t / (1 - p) samples. The time constant 1 / (1 - p) is the area
-    above the step response of the filter (1 - p) z^-1 / (1 - p z^-1), which rises from 0 to 1.
+    A gain factor g multiplies the steady-state gain, which is B(1) / A(1) for the polynomials A
+    and B of the arguments. A time constant factor t multiplies the dominant time constant,
+    which is 1 / (1 - p) samples for the slowest pole p. The time constant 1 / (1 - p) is the
+    area above the step response of the filter (1 - p) z^-1 / (1 - p z^-1), which rises from 0
+    to 1.
 
-    The time constant factor t divides 1 - p, and leaves the polynomial Q unchanged. Dividing
-    1 - p by t also divides A(1) = (1 - p) Q(1) by t. To give the steady-state gain
-    g B(1) / A(1), the polynomial B is therefore multiplied by g / t.
+    A time constant factor t replaces the slowest pole p of the plant by 1 - (1 - p) / t, and
+    leaves the other poles unchanged. The new pole divides A(1), the sum of the coefficients of
+    the polynomial A, by t. To multiply the steady-state gain B(1) / A(1) by the gain factor g
+    alone, the polynomial B is therefore multiplied by g / t.
 
     Parameters
     ----------
@@ -182,10 +186,12 @@ class Dynamics:
             Factors of the temperatures y(k-1), y(k-2), ... in equation (28): the negated
             coefficients of the polynomial A from z^-1 on.
         scale : float or array
-            Factor g / t, by which the polynomial B is multiplied.
+            Gain factor divided by time constant factor, g / t, by which the polynomial B is
+            multiplied.
         load_gain : float or array
-            Factor of the load disturbance w(k) in equation (28): A(1) for the given time
-            constant, so that a constant load w adds w to the steady-state temperature.
+            Factor of the load disturbance w(k) in equation (28): the sum of the coefficients of
+            the polynomial A for the given time constant, so that a constant load w adds w to
+            the steady-state temperature.
         """
         alpha: list[Any] = self._negated_a
         if self._quotient:
@@ -225,7 +231,9 @@ class Plant:
         self._u_min = numbers.u_min
         self._u_max = numbers.u_max
         self._half_range = (numbers.u_max - numbers.u_min) / 2.0
-        self._edge = least_effective_command(numbers.dead_zone, numbers.u_min, numbers.u_max)
+        self._least_effective_command = least_effective_command(
+            numbers.dead_zone, numbers.u_min, numbers.u_max
+        )
         self._drifts = parameters.drifts
         self.factors: dict[str, float] = {}
         self._age = 0
@@ -267,7 +275,7 @@ class Plant:
         command = u_min + (action + 1.0) * self._half_range
         # Equation (29): dead zone and limits.
         applied = command
-        if -self._edge < command < self._edge:
+        if -self._least_effective_command < command < self._least_effective_command:
             applied = 0.0
         elif command < u_min:
             applied = u_min
@@ -389,7 +397,8 @@ class PlantBatch:
             self._clock += 1
             if self._clock >= self._next_update:
                 self._update_dynamics()
-        command = action + _ONE
+        # `_ARRAY_OF_0` and `_ARRAY_OF_1` stand for 0 and 1, as NumPy adds arrays faster.
+        command = action + _ARRAY_OF_1
         command *= self._half_range
         command += self.numbers.u_min
         # Equation (29): limits and dead zone.
@@ -397,8 +406,8 @@ class PlantBatch:
         np.maximum(applied, self._u_min, out=applied)
         # A product is faster than a mask, whose branches are unpredictable. The product can be
         # -0, which adding 0 turns into 0.
-        applied *= np.abs(command) >= self._edge
-        applied += _ZERO
+        applied *= np.abs(command) >= self._least_effective_command
+        applied += _ARRAY_OF_0
         # Equation (28): the sum of B times past flows, the load, and A times past temperatures.
         response = self._input_response.add(applied)
         if self._parameters.changes_dynamics:
@@ -412,11 +421,13 @@ class PlantBatch:
         return command, applied, output
 
     def _update_actuator(self) -> None:
-        """Update the limits and dead zones of `step` after the parameter values change."""
+        """Update limits and dead zones of the actuators after parameter values have changed."""
         u_min = self.numbers.u_min
         u_max = self.numbers.u_max
         self._half_range = np.array((u_max - u_min) / 2.0)
-        self._edge = np.array(least_effective_command(self.numbers.dead_zone, u_min, u_max))
+        self._least_effective_command = np.array(
+            least_effective_command(self.numbers.dead_zone, u_min, u_max)
+        )
         # In comparisons, an array of shape (n,) is faster than an array of one number.
         self._u_min = np.full(self._num_envs, u_min)
         self._u_max = np.full(self._num_envs, u_max)
@@ -442,12 +453,14 @@ class _InputResponse:
 
     B is the polynomial of equation (28) of the paper, u_a the applied flow and d the delay, in
     samples. With a shortest possible delay of s samples, a flow cannot affect the temperatures
-    of the next s samples. The responses to a block of s + 1 successive flows are therefore
-    computed at once, after the last flow of the block, and then returned sample by sample.
+    of the next s samples. The responses to a block of s + 1 successive flows, where s is the
+    shortest possible delay in samples, are therefore computed at once, after the last flow of
+    the block, and then returned sample by sample.
 
     The array `_flows` has one row of applied flows per sample, the oldest sample first. The
     last rows of `_flows` are the block of flows that `add` fills. The first rows of `_flows`
-    hold older flows, which the polynomial B and the longer delays need.
+    hold older flows, which plants with longer delays and the further coefficients of the
+    polynomial B need.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
@@ -484,10 +497,11 @@ class _InputResponse:
             self._delayed_indices[:, plants] = rows * self._num_envs + plants
 
     def add(self, applied: Values) -> Values:
-        """Add the applied flows u_a(k), and return the response B(z^-1) u_a(k+1-d), degC.
+        """Store the applied flows u_a(k), and return the response to all past flows, degC.
 
-        `applied` holds the flows u_a(k) of the plants in t/h, shape (n,). The returned response
-        to the flows is a part of the temperatures y(k+1), shape (n,). The caller must not
+        `applied` holds the flows u_a(k) of the plants in t/h, shape (n,). The returned
+        response, shape (n,), is the part B(z^-1) u_a(k+1-d) of the temperatures y(k+1), with
+        the polynomial B of equation (28) of the paper and the delay d. The caller must not
         modify the returned array.
         """
         self._flows[self._older_rows + self._next_row] = applied
@@ -499,7 +513,7 @@ class _InputResponse:
         return response
 
     def _respond(self) -> None:
-        """Compute the responses to a complete block of flows, and make room for new flows."""
+        """Compute the responses of the plants to a full block of flows, and drop old flows."""
         flows = self._flows
         if self._delays_differ:
             # "clip" is faster than a check of the indices, which are always valid.

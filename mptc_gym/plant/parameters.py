@@ -283,7 +283,7 @@ class Parameters(PlantNumbers[Number]):
             reject("dead_zone", self.dead_zone, f"{allowed} = {largest_command:g}")
 
     def _check_time_constant(self) -> None:
-        """Raise a ValueError if a change of the time constant is not possible with this `a`.
+        """Raise a ValueError if the polynomial `a` allows no change of the time constant.
 
         The slowest pole of 1 / A(z^-1), with the polynomial A of equation (28) of the paper,
         must lie between 0 and 1, and no factor or drift of the time constant may make this pole
@@ -341,7 +341,7 @@ class Parameters(PlantNumbers[Number]):
 
     @cached_property
     def changes_time_constant(self) -> bool:
-        """Whether the plant's time constant can differ from the one that `a` gives."""
+        """Whether the plant can have another time constant than the polynomial `a` gives."""
         return self._can_differ(1.0, "time_constant_factor", "time_constant_drift")
 
     @cached_property
@@ -365,8 +365,8 @@ PLANT_NUMBERS: Final = {number.name: i for i, number in enumerate(fields(PlantNu
 def argument_table() -> str:
     """Return a Markdown table with a row for each argument except `render_mode`.
 
-    The columns of the table are name, default, unit and meaning. An asterisk after the default
-    marks an argument that can be a range [low, high].
+    The columns of the returned table are name, default, unit and meaning. An asterisk after the
+    default marks an argument that can be a range [low, high].
     """
     rows = ["| Argument | Default | Unit | Meaning |", "|---|---|---|---|"]
     for name, argument in ARGUMENTS.items():

@@ -82,7 +82,7 @@ class EpisodeStream:
 
 
 class RandomStreams(NamedTuple):
-    """The random number streams of one plant, one stream for each kind of random quantity.
+    """The random number streams of one plant, such as the stream for the noise.
 
     A new stream must be the last field of `RandomStreams`, so that the random numbers of the
     existing streams do not change.
@@ -113,8 +113,9 @@ class PlantSampler:
 
     From a range of floats, values are sampled uniformly from [low, high), and from a range of
     integers, uniformly from low to high, both included. Every field of `PlantNumbers` has its
-    own random number, whether the field is a range or not. If another field becomes a range, a
-    seed therefore still gives the same values for the fields that were already ranges.
+    own random number, whether the field is a range or not. If a further field of `PlantNumbers`
+    becomes a range, a seed therefore still gives the same values for the fields that were
+    already ranges.
 
     Parameters
     ----------
@@ -139,8 +140,8 @@ class PlantSampler:
         ----------
         streams
             Random number streams of the n plants, one element per plant. If a parameter value
-            or the load is random, `sample` moves the stream `plant` of each plant to the next
-            episode.
+            or the load is random, `sample` moves the random number stream for parameter values
+            and load of each plant to the next episode.
 
         Returns
         -------

@@ -3,7 +3,7 @@
 Every signal class has the methods `reset`, `next` and `ahead`. `reset` begins an episode of
 some plants at sample k = 0. `next` returns the values of a signal at the next sample, one value
 per plant. In an environment with one plant, `ahead` returns the values of a signal at the next
-`SAMPLES_AT_A_TIME` samples, which is faster than calls of `next`.
+600 samples (`SAMPLES_AT_A_TIME`), which is faster than 600 calls of `next`.
 
 Signals draw many random numbers at a time, because one call of a random number generator is
 much faster than many calls and returns the same random numbers.
@@ -114,13 +114,13 @@ class Noise:
         return noise
 
     def ahead(self) -> list[float]:
-        """Return the noise of a single plant at the next `len(self._block)` samples, degC."""
+        """Return the noise of a single plant at the samples of a new block, degC, in a list."""
         self._fill(ONLY_PLANT, 0)
         noise: list[float] = self._block[:, 0].tolist()
         return noise
 
     def _fill(self, plants: Indices, first_row: int) -> None:
-        """Fill `_block` with new noise from row `first_row` on, for the plants `plants`."""
+        """Fill the rows of the noise block from `first_row` on, for the plants `plants`."""
         order = len(self._c) - 1
         samples = len(self._block) - first_row
         for start in range(0, len(plants), PLANTS_AT_A_TIME):
@@ -158,8 +158,8 @@ class SetPointLevels:
         Shortest and longest duration of a random level of the set point, samples.
     values, lengths : list
         Levels of the set point, degC, and durations of these levels, samples. After the last
-        level of the set point, the first level follows again. `values` and `lengths` are empty
-        if the levels are random.
+        level of the set point, the first level follows again. The lists of levels and durations
+        are empty if the levels of the set point are random.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -194,7 +194,7 @@ class SetPointLevels:
 class _HeldSignal(ABC):
     """A signal of n plants whose values are constant between the times of changes.
 
-    Times of changes are counted in samples since the plants were created.
+    The times at which the signal changes are counted in samples since the plants were created.
 
     Attributes
     ----------
@@ -226,7 +226,7 @@ class _HeldSignal(ABC):
 
     @abstractmethod
     def _change(self, plants: Indices) -> None:
-        """Change the signal of the plants `plants`, and set the times of the next changes."""
+        """Change the signal of the plants `plants`, and set when the signal changes next."""
 
 
 class SetPoint(_HeldSignal):
@@ -261,7 +261,7 @@ class SetPoint(_HeldSignal):
         return self.present[plants]
 
     def ahead(self) -> list[float]:
-        """Return the next `SAMPLES_AT_A_TIME` set points of a single plant, degC."""
+        """Return the set points of a single plant at the next 600 samples, degC, in a list."""
         level = self.present.item()
         place = self._places.item()
         known = self._earliest_due - self._clock - 1  # coming samples whose level is known
@@ -297,11 +297,11 @@ class SetPoint(_HeldSignal):
 class Disturbance(_HeldSignal):
     """The load disturbance w(k), degC: a level that jumps, plus a random walk.
 
-    The load changes every `LOAD_INTERVAL` samples. The level and the random walk of the load
-    start at 0. At each change of the load, the level jumps with the probability `LOAD_INTERVAL
-    / disturbance_interval` to a new level that is uniform within +-`disturbance_amplitude`. At
-    each change of the load, the random walk takes a step with a uniform distribution; the sum
-    of many steps is approximately normal.
+    The load changes every 10 samples (`LOAD_INTERVAL`). At the start of an episode, the level
+    and the random walk of the load are 0. At each change of the load, the level jumps with the
+    probability 10 / `disturbance_interval` to a new level that is uniform within
+    +-`disturbance_amplitude`. At each change of the load, the random walk takes a step with a
+    uniform distribution; the sum of many steps is approximately normal.
 
     Parameters
     ----------
@@ -311,23 +311,24 @@ class Disturbance(_HeldSignal):
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
-        self._amplitudes = np.zeros(num_envs)  # largest magnitude of a level, degC
-        self._jump_probabilities = np.zeros(num_envs)  # at each change
-        self._largest_walk_steps = np.zeros(num_envs)  # degC
-        # The two parts of the load at the latest change that has been generated, degC.
+        self._amplitudes = np.zeros(num_envs)  # largest magnitude of a new level, degC
+        self._jump_probabilities = np.zeros(num_envs)  # of a jump of the level
+        self._largest_walk_steps = np.zeros(num_envs)  # largest step of the random walk, degC
+        # Level and random walk of the load, degC, at the last of the changes of load that have
+        # been generated.
         self._last_levels = np.zeros(num_envs)
         self._last_walks = np.zeros(num_envs)
         # The load after each of the next changes of each plant, generated ahead, degC.
         self._loads = np.zeros((num_envs, LOADS_AT_A_TIME))
-        self._next_columns = np.zeros(num_envs, np.intp)  # of each plant's next load
+        self._next_columns = np.zeros(num_envs, np.intp)  # columns of the next loads
 
     def reset(
         self, plants: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
     ) -> None:
-        """Begin an episode of the plants with the indices `plants`, at load 0.
+        """Begin an episode of the plants with the indices `plants`, with a load of 0.
 
-        Before this call, the parameter values of the plants must have been sampled, because the
-        load uses the random numbers that follow in the stream `plant` of each plant.
+        Before this call, the parameter values of the plants must have been sampled: parameter
+        values and load use the same random number stream, in this order.
         """
         self._streams = streams
         self._amplitudes[plants] = numbers.disturbance_amplitude
@@ -346,8 +347,9 @@ class Disturbance(_HeldSignal):
         self._surplus = [0.0] * (LOAD_INTERVAL - 1)
 
     def ahead(self) -> list[float]:
-        """Return the load of a single plant at the next `SAMPLES_AT_A_TIME` samples, degC."""
-        self._generate(ONLY_PLANT)  # as the load starts at 0, a few samples are left over
+        """Return the load of a single plant at the next 600 samples, degC, in a list."""
+        self._generate(ONLY_PLANT)
+        # The load is 0 until the first change, so a few samples are left for the next call.
         samples = [*self._surplus, *np.repeat(self._loads[0], LOAD_INTERVAL).tolist()]
         self._surplus = samples[SAMPLES_AT_A_TIME:]
         return samples[:SAMPLES_AT_A_TIME]
@@ -362,7 +364,7 @@ class Disturbance(_HeldSignal):
         self._due[plants] += LOAD_INTERVAL
 
     def _generate(self, plants: Indices) -> None:
-        """Generate `LOADS_AT_A_TIME` load values for the plants with the indices `plants`."""
+        """Generate the next 60 values of the load of the plants with the indices `plants`."""
         for start in range(0, len(plants), PLANTS_AT_A_TIME):
             chunk = plants[start : start + PLANTS_AT_A_TIME]
             # For each load, three random numbers from 0 to 1: one for the step of the walk, one
@@ -378,8 +380,9 @@ class Disturbance(_HeldSignal):
     def _continue_walks(self, plants: Indices, uniform: Values) -> Values:
         """Return the random walks of some plants at the next changes of the load, degC.
 
-        `uniform`, which holds random numbers from 0 to 1, and the result have the shape
-        (len(plants), number of changes).
+        `uniform` holds random numbers from 0 to 1, one for each step of a random walk.
+        `uniform` and the returned walks have the shape (len(plants), number of changes of the
+        load).
         """
         steps = (2.0 * uniform - 1.0) * self._largest_walk_steps[plants, np.newaxis]
         last_walks = self._last_walks[plants, np.newaxis]
@@ -394,7 +397,8 @@ class Disturbance(_HeldSignal):
 
         `jump_uniform` holds random numbers from 0 to 1 that decide whether the level jumps, and
         `level_uniform` random numbers from 0 to 1 that decide the new level. `jump_uniform`,
-        `level_uniform` and the result have the shape (len(plants), number of changes).
+        `level_uniform` and the returned levels have the shape (len(plants), number of changes
+        of the load).
         """
         jumps = jump_uniform < self._jump_probabilities[plants, np.newaxis]
         new_levels = (2.0 * level_uniform - 1.0) * self._amplitudes[plants, np.newaxis]
@@ -439,8 +443,8 @@ class Signals(NamedTuple):
     ) -> Values:
         """Begin an episode of some plants, and return the set points y_d(0), degC.
 
-        The returned array has the shape (len(plants),). Noise, load disturbance and measurement
-        noise are 0 at sample k = 0.
+        The returned set points have the shape (len(plants),). Noise, load disturbance and
+        measurement noise are 0 at sample k = 0.
 
         Parameters
         ----------
@@ -458,9 +462,10 @@ class Signals(NamedTuple):
         return self.setpoint.reset(plants, streams)
 
     def ahead(self) -> list[tuple[float, ...]]:
-        """Return the next `SAMPLES_AT_A_TIME` samples of all signals of a single plant.
+        """Return all signals of a single plant at the next 600 samples, one tuple per sample.
 
-        Each sample is a tuple of set point y_d, noise n, load w and measurement noise, in degC.
+        Each tuple holds set point y_d, noise n, load w and measurement noise at a sample, in
+        degC.
         """
         columns: list[list[float]] = []
         for signal in self:

@@ -12,7 +12,7 @@ from mptc_gym.plant.parameters import Parameters, PlantNumbers, slowest_pole
 
 
 class PlantState(NamedTuple):
-    """Quantities of n plants that a policy cannot observe, for use in training.
+    """Quantities of n plants that a policy cannot observe, such as the delay, for training.
 
     Each field is a NumPy array of float64, or a PyTorch tensor with the environment's data type
     and on the environment's device, of shape (n,).
@@ -31,7 +31,7 @@ def plant_state(
 ) -> PlantState:
     """Return delay, dead zone, gain, time constant and load of n plants at the present sample.
 
-    Each field of the result has the shape (n,), and is an array or tensor like `load`.
+    Each returned quantity has the shape (n,), and is an array or a tensor, as `load` is.
 
     Parameters
     ----------
@@ -46,7 +46,8 @@ def plant_state(
         Load disturbance w(k) of each plant, degC, shape (n,).
     """
     plants: PlantNumbers[Any] = replace(parameters.lowest, **numbers)
-    # Drifting dynamics change only at samples that are multiples of `DRIFT_INTERVAL`.
+    # A gain or time constant that drifts changes only at samples that are multiples of
+    # `DRIFT_INTERVAL`.
     changed_at = ages - ages % DRIFT_INTERVAL
     gain_factor, time_constant_factor = Dynamics(parameters).factors(plants, changed_at)
     zeros = load * 0.0  # to give each field the shape and type of the load

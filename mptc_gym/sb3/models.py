@@ -136,7 +136,7 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
 
 
 def load(path: str | Path, **arguments: Any) -> BaseAlgorithm:
-    """Load a model from a zip of `save`, with as many new environments as in the training.
+    """Load a model that `save` has saved, with as many new environments as in the training.
 
     Loading runs code from the zip and from the modules that the zip names: load only files that
     you trust.
@@ -208,8 +208,8 @@ class ScoreCallback(BaseCallback):
         Number of training samples between two scores, summed over all plants. The policy is
         scored once more at the end of the training.
     episodes
-        Number of episodes in each score. If plants or set points are random, scores exist only
-        for at most 200 episodes.
+        Number of episodes in which the policy is scored each time. If plants or set points are
+        random, a score needs least possible errors, which are known for at most 200 episodes.
     path
         Path of the zip in which `save` keeps the policy with the least mean error; None to
         write no file. A ValueError is raised if the file at `path` exists before the first

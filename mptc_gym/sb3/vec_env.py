@@ -29,9 +29,10 @@ class GymnasiumVecEnv(VecEnv):
     ----------
     *batches
         Vector environments of Gymnasium with autoreset mode "SameStep" and with equal spaces.
-        The index of an environment counts the environments of all batches, in the given order.
+        The environments of all batches are numbered in the order of the batches.
     spec
-        Spec of a single environment with wrappers; None if the environments differ.
+        `EnvSpec` of one of the environments, with the wrappers; None if the environments
+        differ.
     group
         Number of successive environments that share a seed, and thus all random numbers.
 
@@ -191,7 +192,7 @@ class GymnasiumVecEnv(VecEnv):
 def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
     """Return the infos of all vector environments by name, in arrays of shape (num_envs,).
 
-    An info that any of the vector environments lacks is left out.
+    An info is left out if any of the vector environments lacks this info.
     """
     common_names = set(infos[0]).intersection(*infos[1:])
     joined = {}
@@ -235,9 +236,10 @@ def make_vec_env(
     n_envs
         Number of plants, each of which is one environment.
     seed
-        Seed of the first plant at the first reset; plant i has the seed `seed + i // group`. A
-        model that is made with a seed, as in `PPO(..., seed=1)`, replaces the argument `seed`
-        by the model's seed. If `seed` is None, the seed is random.
+        Seed of the first plant at the first reset; plant i has the seed `seed + i // group`, so
+        that `group` successive plants share a seed. A model that is made with a seed, as in
+        `PPO(..., seed=1)`, replaces the argument `seed` by the model's seed. If `seed` is None,
+        the seed is random.
     group
         Number of successive plants that share a seed. Plants with the same seed have the same
         noise, load and set points, and differ only in the random part of the policy's actions.

@@ -101,7 +101,7 @@ def _check_training(model: Any, plants: Plants) -> None:
 
 
 def _compare(name: str, of_training: Collection[Any], of_env: Collection[Any]) -> None:
-    """Raise a ValueError if `env` and the training environments differ in a property."""
+    """Raise a ValueError if `env` and training environments differ in the property `name`."""
     if of_training == of_env:
         return
     expected = " and ".join(sorted(map(_in_words, of_training)))

@@ -43,9 +43,9 @@ def opened(env: Any, n: int, policy: Any, /, **arguments: Any) -> Iterator[Plant
 
     The forms of `env` and `policy` are those that `mptc_gym.evaluate` takes. If `env` is an id,
     a spec or a function, n plants are made, and closed at the end of the context. If `env` is
-    an environment, the policy acts in a copy. An environment that cannot be copied is used
-    directly, and is reset at the end of the context. Within the context, no wrapper updates
-    normalisation statistics.
+    an environment, the policy acts in a copy of this environment. An environment that cannot be
+    copied is used directly, and is reset at the end of the context. While the policy acts, no
+    wrapper updates normalisation statistics.
 
     A ValueError is raised if `evaluate` does not take the form of `env` or `policy`, if `env`
     holds no NumPy environments of this package, or if `env` is the training environment of
@@ -182,8 +182,8 @@ def _next_seeds(plants: Plants) -> list[int]:
     """Return a seed for the next episode of each plant, computed from the present seeds.
 
     After an evaluation, a user's environments need new seeds, because otherwise the random
-    numbers would follow those of the scored episodes. The new seeds depend only on the present
-    seeds, so a program that is run again gives the same results.
+    numbers would continue where the scored episodes end. The new seeds depend only on the
+    present seeds, so a program that is run again gives the same results.
     """
     present_seeds = np.ravel(plants.unwrapped.np_random_seed).tolist()
     # Gymnasium marks an unknown seed by -1, and a SeedSequence takes no negative number.

@@ -30,7 +30,7 @@ _MODULE_LOCK: Final = threading.RLock()
 
 
 class Form(NamedTuple):
-    """The function that calls a policy, and the objects that have this function."""
+    """How to call a policy: the function to call, and the object whose method it may be."""
 
     function: Callable[..., Any]  # the function to call with observations
     method: str  # "predict" or "act" if `function` is this method; otherwise ""
@@ -42,7 +42,7 @@ class Form(NamedTuple):
 
 
 def form_of(policy: Any) -> Form:
-    """Return the function that calls a policy, and the objects that have this function.
+    """Return how to call a policy: a function, and the object whose method it may be.
 
     A ValueError is raised if `policy` is an environment, a class, or neither a function nor an
     object with a method `predict` or `act`.

@@ -94,8 +94,8 @@ def replayed(
     """Yield the samples of a rollout, and compare each sample with a second simulation.
 
     The second simulation is a `MiddlePointVectorEnv` with the arguments, the seeds and the
-    commands of the rollout. A ValueError is raised if the infos of rollout and second
-    simulation differ, because the environment of the rollout has changed the seed, skipped
+    commands of the rollout. A ValueError is raised if infos of the rollout differ from infos of
+    the second simulation: the environment of the rollout then has changed the seed, skipped
     samples, or changed the plant or the infos.
     """
     plants = MiddlePointVectorEnv(len(seeds), **asdict(parameters))

@@ -116,10 +116,11 @@ class MiddlePointTorchEnv(BatchEnv):
     "setpoint" (the set point y_d), "disturbance" (the load w) and "measurement_noise", in degC,
     have the shape (samples, num_envs): row k holds sample k. The dict `signals` may contain
     values of any argument that is a range, shape (num_envs,), under the name of the argument.
-    Every tensor may have a leading dimension of episodes: the j-th episode of a plant uses
-    element j, and after the last element, the first element again. The environment generates
-    all signals, and draws all values of ranges, that `signals` does not contain. `step` raises
-    a ValueError if the step leads beyond the last sample of an external signal.
+    Every tensor in the dict `signals` may have a leading dimension of episodes: the j-th
+    episode of a plant uses element j, and after the last element, the first element again. The
+    environment generates all signals, and draws all values of ranges, that `signals` does not
+    contain. `step` raises a ValueError if the step leads beyond the last sample of an external
+    signal.
 
     **Gradients.** The gradient of rewards and observations with respect to actions ignores the
     dead zone: a policy can learn from commands in the dead zone, although the true gradient of
@@ -131,10 +132,11 @@ class MiddlePointTorchEnv(BatchEnv):
     graph. A copy or a pickle of the environment, even in the middle of an episode, has no
     gradient graph of earlier actions.
 
-    **Waiting.** `step` never waits for the device to finish its computations. For this reason,
-    `step` raises a ValueError for actions that are not finite only on a CPU. On other devices,
-    a plant whose action is not finite may have the temperature NaN until the plant is reset.
-    `reset` may wait for the device.
+    **Waiting.** `step` never waits for the device to finish its computations. As a check of the
+    actions would wait for the device, `step` raises a ValueError for actions that are not
+    finite only on a CPU. On devices other than a CPU, a plant whose action is not finite may
+    have the temperature NaN until the plant is reset. `reset` may wait for the device to finish
+    its computations.
 
     **Memory.** The caller may keep or overwrite the tensors that `step` returns, except the
     masks and the drift factors in the infos, which several steps may share. Tensors that
@@ -240,7 +242,7 @@ class MiddlePointTorchEnv(BatchEnv):
         return observations, rewards, terminations, truncations, infos
 
     def _compute_block(self) -> None:
-        """Compute the results of the next steps, and store them in `_ahead` and `_window`.
+        """Compute and store the results and the observations of a block of future steps.
 
         An action affects the temperature only after the delay, so past actions determine the
         temperatures of a block of successive samples.
@@ -293,7 +295,7 @@ class MiddlePointTorchEnv(BatchEnv):
             self._ahead.append(step)
 
     def _rewards(self, error: Tensor) -> Tensor:
-        """Return the rewards for control errors, degC, without the term of `move_weight`."""
+        """Return the rewards for control errors, degC, without the cost of changed actions."""
         scale = self.parameters.error_scale
         if self.parameters.reward == "quadratic":
             zero = error.new_zeros(())
@@ -429,8 +431,8 @@ def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePoint
     Returns
     -------
     MiddlePointTorchEnv
-        Environment of `num_envs` plants. The attribute `spec` describes one plant in NumPy, for
-        calls such as `mptc_gym.evaluate(policy, envs.spec)`.
+        Environment of `num_envs` plants. The attribute `spec` of the environment describes one
+        plant in NumPy, for calls such as `mptc_gym.evaluate(policy, envs.spec)`.
 
     Raises
     ------

@@ -49,14 +49,14 @@ class Block(NamedTuple):
     due_rows: list[int]  # rows at which the load or the dynamics of some plant change
 
     def age(self, row: int) -> Tensor | int:
-        """Return the sample number k at a row, shape (n,), or one number for all plants."""
+        """Return the sample number k at a row of the block, shape (n,), or one number."""
         return self.first_time + row - self.starts
 
     def ages(self, device: torch.device) -> Tensor:
-        """Return the sample numbers k at all rows, as a tensor on `device`.
+        """Return the sample numbers k at all rows of the block, as a tensor on `device`.
 
-        The shape is (samples, n), or (samples, 1) if the episodes of all plants began at one
-        time.
+        The returned tensor has the shape (samples, n), or (samples, 1) if the episodes of all
+        plants began at one time.
         """
         return torch.arange(self.samples, device=device)[:, None] + self.age(0)
 
@@ -74,8 +74,9 @@ class History:
     Attributes
     ----------
     rows : list of Tensor
-        Values, one tensor of shape (n,) for each sample, the oldest first: `length` samples
-        before the latest block of successive samples, then the samples of the block.
+        Values of the variable, one tensor of shape (n,) for each sample, the oldest first: a
+        fixed number of samples before the latest block of successive samples, then the samples
+        of the block.
     """
 
     def __init__(self, zeros: Tensor, length: int) -> None:
@@ -84,7 +85,7 @@ class History:
         self._length = length
 
     def extend(self, block: Sequence[Tensor]) -> None:
-        """Append the samples of `block`, and keep only `length` samples before `block`."""
+        """Append the samples of `block`, and drop samples that are no longer needed."""
         self.rows = [*self.rows[len(self.rows) - self._length :], *block]
 
     def reset(self, restart: Restart, newest: Tensor | None = None) -> None:
@@ -111,7 +112,7 @@ class Episodes:
     Attributes
     ----------
     zeros : Tensor
-        Zeros, shape (n,), with the device and the type of all tensors.
+        Zeros, shape (n,), with the device and the data type of all tensors of the environment.
     generator : torch.Generator
         Random number generator of the environment.
     numbers : dict
@@ -124,7 +125,8 @@ class Episodes:
     def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
         """Prepare the parameter values of n plants, before the first reset.
 
-        `zeros` holds n zeros, with the device and the type of all tensors.
+        `zeros` holds n zeros, with the device and the data type of all tensors of the
+        environment.
         """
         self.zeros = zeros
         self.generator = torch.Generator(zeros.device)
@@ -170,8 +172,8 @@ class Episodes:
         Returns
         -------
         dict of Tensor
-            New values by the name of the argument, shape (n,). Elements of plants outside
-            `restart.mask` have no meaning.
+            New values of the arguments that are ranges, by name of the argument, shape (n,).
+            Elements of plants outside `restart.mask` have no meaning.
         """
         numbers: dict[str, Tensor] = {}
         for name, (low, high) in self._ranges.items():
@@ -205,7 +207,7 @@ class Episodes:
     def draw(self, low: float, high: float, *, is_integer: bool) -> Tensor:
         """Return random numbers, uniform from `low` to `high`, both included, shape (n,).
 
-        The numbers are integers if `is_integer` is True, but have the type of `zeros`.
+        If `is_integer` is True, the numbers are integers in a tensor of floats.
         """
         numbers = torch.empty_like(self.zeros)
         numbers.uniform_(low, high + is_integer, generator=self.generator)
@@ -223,7 +225,7 @@ class ExternalValues:
     Attributes
     ----------
     last_sample : int
-        Sample number k of the last value that the tensor has for an episode.
+        Last sample number k of an episode for which the tensor has a value.
     """
 
     def __init__(self, values: Tensor) -> None:
@@ -238,9 +240,9 @@ class ExternalValues:
         self.last_sample = values.shape[1] - 1
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin the next episode of plants in `restart.mask`, and return all values at k = 0.
+        """Begin an episode of plants in `restart.mask`, and return all plants' values at k = 0.
 
-        The tensor that is returned has the shape (n,).
+        The returned values have the shape (n,).
         """
         self._episode = self._episode + restart.mask
         return self._at(torch.zeros_like(self._episode)[None])[0]
@@ -252,8 +254,8 @@ class ExternalValues:
     def _at(self, ages: Tensor) -> Tensor:
         """Return the values of the present episodes at the sample numbers `ages`.
 
-        `ages` has the shape (samples, n), or (samples, 1) for all plants. The tensor that is
-        returned has the shape (samples, n).
+        `ages` has the shape (samples, n), or (samples, 1) for all plants. The returned values
+        have the shape (samples, n).
         """
         episodes, samples, _ = self._values.shape
         # With episodes and samples as one axis, an episode begins every `samples` rows.
@@ -269,8 +271,8 @@ def read_external(
 
     A ValueError is raised for an unknown name, and for values that have the wrong shape, are
     not finite or out of range. `signals` is `options["signals"]`, as in `MiddlePointTorchEnv`,
-    or None without that option. `zeros` holds n zeros, with the device and the type of all
-    tensors.
+    or None without that option. `zeros` holds n zeros, with the device and the data type of all
+    tensors of the environment.
     """
     if signals is None:
         return {}
@@ -299,10 +301,10 @@ def read_external(
 def _finite_values(path: str, value: Any, zeros: Tensor, dimensions: int, shape: str) -> Tensor:
     """Return numbers of the user as a tensor that has a leading dimension of episodes.
 
-    In `value`, the dimension of episodes may be missing. The numbers of one episode have
-    `dimensions` dimensions, of which the last has the size n of `zeros`. A ValueError, which
-    calls the numbers `path` and their shape `shape`, is raised if a number is not finite, or if
-    `value` has a wrong shape.
+    The numbers `value` may lack the leading dimension of episodes. The numbers of one episode
+    have `dimensions` dimensions, of which the last has the size n of `zeros`. A ValueError is
+    raised if a number is not finite, or if `value` has a wrong shape; the message contains the
+    texts `path`, which names the numbers, and `shape`, the right shape.
     """
     values = as_tensor(value, zeros)
     if values is None:
@@ -324,8 +326,9 @@ def _finite_values(path: str, value: Any, zeros: Tensor, dimensions: int, shape:
 def _check_range(path: str, values: Tensor, ends: tuple[float, float]) -> None:
     """Raise a ValueError if one of `values` is not in the range of an argument.
 
-    `ends` are the ends of the range. If these ends are integers, all values must be integers.
-    The error message calls the values `path`.
+    `ends` are the lower and the upper end of the range. If the ends of the range are integers,
+    all values must be integers. The error message contains the text `path` as the name of the
+    values.
     """
     low, high = values.new_tensor(ends)
     fits = (low <= values) & (values <= high)

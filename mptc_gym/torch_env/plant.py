@@ -61,8 +61,8 @@ class TorchPlants:
     ----------
     most_samples : int
         Maximum number of samples in a block: d + 1, where d is the shortest delay that can be
-        drawn. The temperatures of the d + 1 samples after an action do not depend on later
-        actions.
+        drawn. With a delay of d samples, the temperatures of the d + 1 samples after an action
+        do not depend on later actions.
     """
 
     def __init__(self, parameters: Parameters, episodes: Episodes) -> None:
@@ -119,8 +119,8 @@ class TorchPlants:
     def _reset_delays(self) -> None:
         """Compute the indices at which `_response` reads the delayed flows of each plant.
 
-        The indices, shape (rows, n), refer to the flows of all plants in one flat tensor.
-        Without random delays, `_response` needs no indices.
+        The computed indices, shape (rows, n), refer to the applied flows of all plants in one
+        flat tensor. If all plants always have the same delay, `_response` needs no indices.
         """
         self._delayed_at: Tensor | None = None
         delay = self._episodes.numbers["delay"]
@@ -134,9 +134,10 @@ class TorchPlants:
     def _update_dynamics(self, age: Tensor | int) -> None:
         """Compute the coefficients of equation (28) of the paper at sample k = `age`.
 
-        The coefficients are factors of past temperatures, past flows and load. If gain and time
-        constant drift, the coefficients change at sample numbers that are multiples of
-        `DRIFT_INTERVAL`. `age` has the shape (n,), or is one number for all plants.
+        The coefficients multiply past temperatures, past flows and the load in equation (28).
+        If gain and time constant drift, the coefficients change at sample numbers that are
+        multiples of `DRIFT_INTERVAL`. `age` is the sample number k of each plant, shape (n,),
+        or one number for all plants.
         """
         if self._drifts:
             if isinstance(age, Tensor):
@@ -179,8 +180,8 @@ class TorchPlants:
             Block of at most `most_samples` samples, which follow the last action that `apply`
             has applied.
         noise, load
-            Coloured noise n and load w, degC, shape (samples, n). None means that the signal is
-            always 0.
+            Coloured noise n and load w, degC, shape (samples, n). None for the noise or the
+            load means that this signal is always 0.
 
         Returns
         -------

@@ -42,7 +42,7 @@ class Noise:
         self._xi = episodes.zeros.expand(self._order, -1)
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin an episode of the plants in `restart.mask`, and return zeros, shape (n,)."""
+        """Begin an episode of plants in `restart.mask`, and return 0, the noise at k = 0."""
         self._deviation = self._episodes.numbers[self._variance_name] ** 0.5
         used_rows = self._xi[: len(self._xi) - restart.unused_rows]
         self._xi = used_rows.masked_fill(restart.mask, 0.0)
@@ -75,7 +75,7 @@ class RandomSetPoint:
     """
 
     def __init__(self, levels: SetPointLevels, episodes: Episodes) -> None:
-        """Prepare to draw levels and their lengths from the distribution in `levels`."""
+        """Prepare to draw random levels and their durations, as `levels` describes."""
         self._distribution = levels
         self._episodes = episodes
         zeros = episodes.zeros
@@ -89,7 +89,7 @@ class RandomSetPoint:
     def reset(self, restart: Restart) -> Tensor:
         """Begin an episode of the plants in `restart.mask`, and return the first set points.
 
-        The set points y_d(0), degC, have the shape (n,).
+        The returned set points y_d(0), degC, have the shape (n,).
         """
         self._time -= restart.unused_rows
         self._forget_past_levels()
@@ -113,7 +113,7 @@ class RandomSetPoint:
         return torch.where(times[:, None] >= self._level_end, self._next_level, self._level)
 
     def _draw(self) -> tuple[Tensor, Tensor]:
-        """Return a random level, degC, and its length, samples, for each plant: shape (n,)."""
+        """Return random levels of the set point, degC, and durations, samples, shape (n,)."""
         distribution = self._distribution
         levels = self._episodes.draw_within_one(1)[0] * distribution.amplitude
         lengths = self._episodes.draw(
@@ -132,7 +132,7 @@ class RepeatedSetPoint:
     """Set point that repeats one sequence of levels for all plants."""
 
     def __init__(self, levels: SetPointLevels, episodes: Episodes) -> None:
-        """Store the levels, degC, and the lengths of the levels, samples, from `levels`."""
+        """Store the set point's levels, degC, and their durations, samples, from `levels`."""
         self._n = len(episodes.zeros)
         self._levels = episodes.zeros.new_tensor(levels.values)
         # The samples of a period at which the levels end.
@@ -152,20 +152,22 @@ class RepeatedSetPoint:
 
 
 class Disturbance:
-    """Load disturbance w(k) of many plants, degC: the sum of random steps and a random walk.
+    """Load disturbance w(k) of many plants, degC: a level that jumps, plus a random walk.
 
-    `mptc_gym.plant.signals.Disturbance` documents the distributions of the steps and the walk.
+    `mptc_gym.plant.signals.Disturbance` documents the distributions of the level and the random
+    walk.
     """
 
     def __init__(self, episodes: Episodes) -> None:
         """Begin with a load of 0, and draw random numbers from the generator in `episodes`."""
         self._episodes = episodes
-        # The two parts of the load, steps and walk, degC.
+        # The load is the sum of two parts, degC: the level, which jumps in random steps, and
+        # the random walk.
         self._steps = History(episodes.zeros, length=1)
         self._walk = History(episodes.zeros, length=1)
 
     def reset(self, restart: Restart) -> Tensor:
-        """Begin an episode of the plants in `restart.mask`, and return zeros, shape (n,)."""
+        """Begin an episode of plants in `restart.mask`, and return 0, the load at k = 0."""
         self._steps.reset(restart)
         self._walk.reset(restart)
         return self._episodes.zeros
@@ -186,15 +188,16 @@ class Disturbance:
         return torch.stack(steps).add_(torch.stack(walks))
 
     def _change(self, step: Tensor, walk: Tensor, age: Tensor | int) -> tuple[Tensor, Tensor]:
-        """Return the next values of steps and random walk, degC, each of shape (n,).
+        """Return the load's next level and next random walk, degC, both of shape (n,).
 
-        `step` and `walk` are the present values, degC, shape (n,). `age` is the sample number k
-        of each plant, shape (n,), or one number for all plants. The load of a plant changes
-        only if k is a multiple of `LOAD_INTERVAL`.
+        `step` and `walk` are the present level and the present random walk of the load, degC,
+        shape (n,). `age` is the sample number k of each plant, shape (n,), or one number for
+        all plants. The load of a plant changes only at sample numbers that are multiples of 10
+        (`LOAD_INTERVAL`).
         """
         numbers = self._episodes.numbers
         step_draws, walk_draws = self._episodes.draw_within_one(2)
-        # The mean number of samples between two jumps of the sum of steps.
+        # The mean number of samples between two jumps of the level.
         interval = numbers["disturbance_interval"]
         if isinstance(interval, Tensor):
             interval = interval.clamp(min=LOAD_INTERVAL)

@@ -19,7 +19,8 @@ class Window:
         windows
             Numbers of set points, errors, outputs and past actions in an observation.
         zeros
-            Zeros, shape (n,), with the device and the type of all tensors.
+            Zeros, shape (n,), with the device and the data type of all tensors of the
+            environment.
         """
         *self._windows, self._past_actions = windows
         self._zeros = zeros
@@ -43,9 +44,10 @@ class Window:
         self._actions = torch.where(restart.mask, rest_action.clamp(-1.0, 1.0), self._actions)
 
     def extend(self, *blocks: Tensor) -> None:
-        """Add successive samples of set points, errors and outputs, in the order named here.
+        """Append successive samples of set points, errors and outputs to the stored samples.
 
-        Each tensor in `blocks` has the shape (samples, n), degC.
+        `blocks` holds three tensors of shape (samples, n), degC: set points, errors and
+        outputs.
         """
         for history, window, block in zip(self._histories, self._windows, blocks, strict=True):
             if window:
@@ -79,7 +81,8 @@ class Window:
     def _stack(self, samples: int, first_place: int) -> list[Tensor]:
         """Return observations at successive samples, without actions, each of shape (size, n).
 
-        The first of the `samples` observations begins at index `first_place` of the histories.
+        The first of the `samples` observations begins at the index `first_place` of the stored
+        set points, errors and outputs.
         """
         newest_first: list[Tensor] = []  # the elements of all observations, shape (n,) each
         for place in range(first_place, first_place + samples):
