@@ -248,7 +248,7 @@ def read_times(column: pd.Series[str], separator: str) -> NDArray[np.float64]:
 
 
 def refuse(column: pd.Series[str], is_bad: pd.Series[bool], allowed: str) -> None:
-    """Raise a `UsageError` that names the first line of a column for which `is_bad` is true.
+    """Raise a `UsageError` that names the first line in which `is_bad` is true, if any.
 
     `allowed` says what the column must contain, such as "a number".
     """
@@ -292,8 +292,8 @@ def sample_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float
 def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
     """Return warnings for the report: a sentence for each reason why a fit may be wrong.
 
-    `intervals` is a table of estimates with 95 % intervals (`estimates`), and `explained` is
-    the share of the temperature's variance that the model explains (`explained_share`).
+    `intervals` is the table that the function `estimates` returns, and `explained` is the share
+    of the temperature's variance that the model explains, a result of `explained_share`.
     """
     sentences = []
     last_third = fit.log.flow[-(len(fit.log.flow) // 3) :]
@@ -326,8 +326,8 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
 def is_white(errors: NDArray[np.float64]) -> bool:
     """Return whether successive prediction errors, shape (blocks,), look like white noise.
 
-    The result is true if chance explains at least three quarters of the autocorrelations of the
-    errors at lags from 1 to 30.
+    The result is true if at least three quarters of the autocorrelations of the errors, at lags
+    from 1 to 30 blocks, are small enough to be due to chance.
     """
     correlations = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
     # By chance, about 1 % of the autocorrelations of n errors are larger than 2.5 / sqrt(n).
@@ -402,10 +402,10 @@ def is_one_sided(u_min: float, u_max: float) -> bool:
 def argument_ranges(
     intervals: pd.DataFrame, arguments: dict[str, Any]
 ) -> dict[str, list[float]]:
-    """Return 95 % intervals of the environment's arguments, as ranges [low, high] by name.
+    """Return 95 % intervals of arguments of the environment, as ranges [low, high] by name.
 
-    An argument whose interval has the length 0 is left out. `intervals` is a table of estimates
-    with 95 % intervals (`estimates`), and `arguments` is a result of `plant_arguments`.
+    An argument whose interval has the length 0 is left out. `intervals` is the table that the
+    function `estimates` returns, and `arguments` is a result of `plant_arguments`.
     """
     limits = intervals[["low", "high"]].T
     largest_flow = max(-arguments["u_min"], arguments["u_max"])
@@ -430,8 +430,8 @@ def findings(
 ) -> list[str]:
     """Return the paragraphs of the report that describe a fit and the plant.
 
-    `explained` is the share of the temperature's variance that the model explains
-    (`explained_share`), and `arguments` is a result of `plant_arguments`.
+    `explained` is the share of the temperature's variance that the model explains, a result of
+    `explained_share`, and `arguments` is a result of `plant_arguments`.
     """
     log, centre = fit.log, fit.zone.centre
     text = [
@@ -471,7 +471,7 @@ def findings(
 
 
 def table_of(intervals: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of estimates with 95 % intervals as strings, for the report."""
+    """Return a plant's estimated parameters and 95 % intervals as a table of strings."""
     texts = intervals.map("{:.4g}".format)
     texts["95 % interval"] = "[" + texts.low + ", " + texts.high + "]"
     texts.insert(0, "", texts.index.str.replace("_", " "))

@@ -54,7 +54,7 @@ CAPTION = "Error ratio over valve travel of three linear controllers at several 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Run PI (SIMC), Smith and Dahlin, each tuned to several values of the robustness Ms."""
+    """Run PI (SIMC), Smith and Dahlin, each tuned to several maximum sensitivities Ms."""
 
     runs: Runs = 100
     """The number of runs of each controller in each case with noise or load."""

@@ -24,10 +24,10 @@ PLANTS: dict[str, Any] = {"": {}, ", R = 0.5": PRESETS["noisy"], ", hard": PRESE
 
 
 class Case(NamedTuple):
-    """A function that steps an environment, and the number of steps in a call."""
+    """A function that steps an environment, and the number of steps in each call of it."""
 
-    run: Callable[[], object]  # the function
-    steps: int  # summed over all plants
+    run: Callable[[], object]  # steps an environment
+    steps: int  # number of steps in a call of `run`, summed over all plants
 
 
 @options
@@ -36,7 +36,7 @@ class Options:
     """Compare the steps a second of the environments with those of Gymnasium's CartPole.
 
     In each round, all environments are timed once. The printed ratio is the median, over all
-    rounds, of the ratio to CartPole in the same round.
+    rounds, of the speed divided by the speed of CartPole in the same round.
     """
 
     rounds: Runs = 15
@@ -90,7 +90,7 @@ def stepping(env: Any) -> Case:
     """Return a `Case` that steps an environment with random actions.
 
     A vector environment, which resets itself, makes `EPISODE` + 1 steps. A single environment
-    makes 10 `EPISODE` steps, and is reset when an episode has ended.
+    makes 10 times `EPISODE` steps, and is reset when an episode has ended.
 
     Parameters
     ----------
@@ -133,8 +133,9 @@ def compare(cases: Mapping[str, Case], rounds: int) -> Any:
     """Measure the speed of each case in `rounds` rounds, and return a DataFrame of text.
 
     Each case is timed once in each round. A row of the DataFrame has the name of a case, the
-    median of the steps per second, and the ratio to the first case. The ratio is the median,
-    with the 10th and the 90th percentile in parentheses, of the ratios in the same round.
+    median of the steps per second, and the ratio to the speed of the first case. The ratio is
+    computed in each round, and the row has the median over the rounds, with the 10th and the
+    90th percentile in parentheses.
     """
     import pandas as pd  # imported here, as pandas would slow `--help` down
 

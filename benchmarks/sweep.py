@@ -261,8 +261,8 @@ def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
 
     `case` has the environment's arguments for the plant, and `runs` is the number of runs. The
     result has the measures of `run_agent`, and "least_possible", the least possible mean error
-    of any controller, degC. The least possible mean error is NaN if the plant does not settle
-    between changes of the set point.
+    of a controller that does not foresee changes of the set point, degC. The least possible
+    mean error is NaN if the plant does not settle between changes of the set point.
     """
     from benchmarks.bounds.least import least_possible
 
@@ -274,9 +274,10 @@ def run_idle_valve(case: Arguments, runs: int) -> dict[str, Any]:
 
 
 def swing(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Return the standard deviation of the error on steady stretches, degC, shape (runs,).
+    """Return the standard deviation of the error while the set point is held, degC.
 
-    A steady stretch is the second half of the samples between two changes of the set point.
+    Of the samples between two changes of the set point, only the second half (a steady stretch)
+    counts. The result has the shape (runs,).
     """
     errors = trajectory.setpoint - trajectory.output
     variances = []
@@ -330,13 +331,13 @@ def table(
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of results over all runs, with a row for each controller.
+    """Return a table that summarises all runs of each controller, in a row for each controller.
 
     The columns are:
 
     - `agent`: the name of the controller;
-    - `multiple` and `multiple_p90`: the median and the 90th percentile over the plants, where
-      the value of a plant is the median of `ratio` over the runs on the plant;
+    - `multiple` and `multiple_p90`: the median and the 90th percentile, over the plants, of the
+      error ratio of a plant, which is the median over the runs on the plant;
     - `travel`: the median valve travel of the runs, t/h;
     - `oscillates`: the share of the runs that oscillate, %;
     - `useless`: the share of the runs that are no better than an idle valve, %.
@@ -354,11 +355,11 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def report(runs: pd.DataFrame, out: Path, nominal: Parameters, provenance: Arguments) -> None:
-    """Draw the map of errors, write the report to the folder `out`, and print the report.
+    """Draw the picture of error ratios, write the report to the folder `out`, and print it.
 
-    If plants drift, the report has a table for each of `QUESTIONS` whose controllers have run.
-    `runs` is the table that the function `table` returns. `provenance` has the command, the
-    commit of the code and the versions of Python and of packages.
+    If plants drift, the report has a table of error differences for each of `QUESTIONS` whose
+    controllers have run. `runs` is the table that the function `table` returns. `provenance`
+    has the command, the commit of the code and the versions of Python and of packages.
     """
     from benchmarks.lib.report import Section, write_report
     from benchmarks.plots.sweep import draw

@@ -161,8 +161,8 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
     """Return a table of the scores of the best `FINALISTS` trials on new runs, best first.
 
     New runs are necessary because the best result of many trials is partly luck. A row has the
-    numbers that `score` returns, and "in the search", the objective of the trial, degC.
-    `trials` is the table that `search` returns.
+    numbers that `score` returns, and "in the search", the objective that the same gains had in
+    the search, degC. `trials` is the table that `search` returns.
     """
     import pandas as pd
 
@@ -176,10 +176,10 @@ def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
 
 
 def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
-    """Return a table of the objectives of the controllers in `FIXED_GAINS[name]` on new runs.
+    """Return a table of the objectives, on new runs, of gains that are older than the search.
 
-    A row has the label of a controller, the origin of the gains, the gains, and the objective,
-    degC, all as strings.
+    The table has a row for each controller in `FIXED_GAINS[name]`, with the label of the
+    controller, the origin of the gains, the gains, and the objective, degC, all as strings.
     """
     import pandas as pd
 
@@ -206,7 +206,7 @@ def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
 
 
 def cases(plant: Arguments) -> dict[str, TuningCase]:
-    """Return the cases of a search on a plant, by name: `CASES`, scaled to the plant.
+    """Return the cases of a search for gains, by name: `CASES`, scaled to the plant.
 
     The set points are scaled in proportion to `setpoint_amplitude`, the lengths of the runs in
     proportion to `setpoint_period`, and the dead zone and the noise variance in proportion to
@@ -253,7 +253,7 @@ def middle(plant: Parameters, name: str) -> float:
 
 
 def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> pd.DataFrame:
-    """Try `count` sets of gains of a controller, and return the results of `score` as rows.
+    """Try `count` sets of gains of a controller, and return a table of the results of `score`.
 
     After an interruption, the file `trials.csv` in `folder` has the rows of the finished
     trials. A search that starts again tries the same gains as before, and loads the results of
@@ -319,8 +319,8 @@ def score(
     - the gains;
     - the median over the runs of the mean error in each case, degC, by the name of the case;
     - "not converged": the share of runs that do not settle at the constant set point;
-    - "objective": the mean of the medians, plus a penalty in proportion to "not converged",
-      degC. The search minimises the objective.
+    - "objective": the mean of the medians over the cases, plus a penalty in proportion to "not
+      converged", degC. The search minimises the objective.
 
     Parameters
     ----------

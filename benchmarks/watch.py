@@ -49,9 +49,10 @@ def work(options: Options) -> str:
     """
     cases = options.plant.cases(SCENARIOS)
     case_name = options.scenario or next(iter(cases))
-    known("--scenario", [case_name], cases)
+    known("--scenario", [case_name], cases)  # raises a UsageError for an unknown name
     case = cases[case_name]
-    if "=" in options.agent:
+    # `chosen` returns controllers by name, here a single one.
+    if "=" in options.agent:  # the user's own controller
         (controller,) = chosen([], [options.agent]).values()
     else:
         (controller,) = chosen(agent_names("--agent", [options.agent])).values()
@@ -60,6 +61,7 @@ def work(options: Options) -> str:
     if path.suffix != ".gif":
         raise UsageError(f"--video: the file must end in .gif, got {path}")
     out_folder(path.absolute().parent, "--video")
+    # Of a controller with several trained networks, the film shows the first network.
     first_member = controller.members()[0]
     trajectory = first_member.run(case.arguments, case.samples, 1, options.seed)
     write_film(path, trajectory, case.parameters, options.seed)

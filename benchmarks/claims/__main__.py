@@ -29,7 +29,7 @@ class Options:
 
 
 def work(options: Options) -> str:
-    """Test claims of the paper, write a report, and return a sentence that names its file.
+    """Test claims of the paper, write a report, and return a message with its path.
 
     If the test of a claim raises an error, the report on the finished tests is written before
     the error is raised again.

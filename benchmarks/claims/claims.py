@@ -158,7 +158,7 @@ CLAIMS = {
 
 
 def examined(name: str, batch: Batch) -> list[Finding]:
-    """Run the examination of a claim, and return all findings about the claim."""
+    """Call the function that examines a claim, and return all findings about the claim."""
     examine = CLAIMS[name].examine
     if examine is None:
         return []

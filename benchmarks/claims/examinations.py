@@ -1,8 +1,8 @@
 """Run controllers to examine the paper's claims, and judge the results by criteria.
 
 The paper is that of Cui and Shin (1992), whose controller is a neural network (NN) that learns
-online. Each function that takes a `Batch` and returns `Findings` examines one claim, or two
-similar claims.
+online. Each function of this module that takes a `Batch` of runs and returns `Findings`
+examines one claim, or two similar claims.
 """
 
 import itertools
@@ -177,8 +177,8 @@ def best_lower_gain(batch: Batch, title: str, arguments: Arguments) -> Finding:
 def largest_pole(gains: PIGains) -> float:
     """Return the largest magnitude of the poles of a PI controller's loop on the paper's plant.
 
-    The loop, in which dead zone and limits of the actuator are left out, is stable if the
-    largest magnitude is below 1.
+    Dead zone and limits of the actuator are left out of the loop. The loop is stable if the
+    largest magnitude of its poles is below 1.
     """
     plant = linear.nominal(Parameters())
     return linear.LinearLoop.of(PIController(gains["kp"], gains["ki"]), plant).largest_pole()
@@ -235,9 +235,10 @@ def wrong_direction(batch: Batch) -> Findings:
 def other_shapes(batch: Batch, shapes: Mapping[str, dict[str, int]]) -> Findings:
     """Compare networks with more nodes or inputs with the paper's network.
 
-    `shapes` gives, for the title of each kind of network in the report, the argument `nodes` or
-    `length` of `Batch.networks`. Each kind of network runs with the paper's learning rates, and
-    with smaller learning rates (the argument `in_proportion` of `Batch.networks`).
+    `shapes` maps the title of each kind of network in the report to arguments of
+    `Batch.networks`: {"6 hidden nodes": {"nodes": 6}}, for example. Each kind of network runs
+    with the paper's learning rates, and with smaller learning rates (the argument
+    `in_proportion` of `Batch.networks`).
     """
     noisy_square = Scenario("noisy-square", NOISY_SQUARE_TITLE, RUN_LENGTH, WITH_NOISE)
     for case in (*SETPOINTS, noisy_square):
@@ -288,10 +289,10 @@ def reliability(batch: Batch) -> Findings:
 
 
 def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None:
-    """Damage the first hidden node of each network at the sample k = `LEARNING_LENGTH`.
+    """Damage the first hidden node of each network if the sample k is `LEARNING_LENGTH`.
 
-    At any other sample, nothing happens. After the damage, the output of the damaged node is
-    always `stuck_at`, which is 0 or 1. All undamaged nodes continue to learn.
+    After the damage, the output of the damaged node is always `stuck_at`, which is 0 or 1. All
+    undamaged nodes continue to learn.
     """
     if k != LEARNING_LENGTH:
         return
@@ -306,8 +307,8 @@ def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None
 def keep_learning(batch: Batch) -> Findings:
     """Compare learning and frozen networks on plants that differ from the training plant.
 
-    The networks first learn on the paper's plant. After this training, the gain or the delay of
-    the plant changes, and the weights of the networks either continue to learn or are frozen.
+    The networks first learn on the paper's plant. Then they run on plants with another gain or
+    delay, while their weights either continue to learn or are frozen.
     """
     networks = batch.networks()
     batch.run(networks, RUN_LENGTH, **SQUARE_WAVE)
@@ -345,8 +346,9 @@ def direction_only(batch: Batch) -> Findings:
 
     The steady flow for a set point of 5 degC lies beyond the actuator's limits if the gain is
     below 0.74 of the paper's gain, and inside the dead zone if the gain is above 1.46 of the
-    paper's gain. Hence two series of runs are made: with a set point of 5 degC for all plants,
-    and with a set point of 5 degC times the gain factor of the plant.
+    paper's gain. Hence the network runs on all plants twice: with a set point of 5 degC, and
+    with a set point of 5 degC times the gain factor of the plant (its gain as a multiple of the
+    paper's gain).
     """
     fixed = plants_that_settle(batch, gains=(0.75, 1.0, 1.25, 1.4), is_scaled=False)
     scaled = plants_that_settle(batch, gains=(0.7, 1.0, 1.25, 1.5), is_scaled=True)
@@ -398,7 +400,7 @@ def plants_that_settle(
 
 
 def judge_worst(plants: pd.DataFrame, text: str) -> Finding:
-    """Return a finding about the plant on which the smallest share of runs settles.
+    """Judge the share of runs that settle, on the plant with the smallest share.
 
     `plants` are rows of the table that `plants_that_settle` returns, and `text` describes these
     plants in the report.

@@ -38,22 +38,23 @@ def judge(
     quantity
         What was measured, in words.
     value
-        The measured number: an `Estimate`; or an exact number; or an array with a value for
-        each run, shape (runs,), in place of which the finding has the median over the runs.
+        The measured number: an `Estimate`, or an exact number, or an array with a value for
+        each run, shape (runs,). Of an array, the finding has the median over the runs.
     unit
         Unit of the number in the report; "" if the number has no unit.
     at_least, at_most
-        Lower and upper bound of the measured number that a claim of the paper asks for. If both
-        bounds are infinite, the number is for information only, and does not count in the
-        verdict.
+        Smallest and largest value of the measured number that meet the criterion of a claim. If
+        `at_least` and `at_most` are infinite, the number is for information only, and does not
+        count in the verdict on the claim.
 
     Returns
     -------
     dict
         The finding has the keys `quantity`, `unit`, `value`, `low`, `high` and `runs` (the
-        attributes of an `Estimate`), `criterion` (the bounds in words) and `shown`. The value
-        of `shown` is "yes" if the entire 95 % interval satisfies the bounds, "no" if the entire
-        interval violates a bound, and otherwise "undecided". If both bounds are infinite,
+        attributes of an `Estimate`), `criterion` (`at_least` and `at_most` in words) and
+        `shown`. The value of `shown` is "yes" if the entire 95 % interval of the number lies
+        from `at_least` to `at_most`, "no" if the entire interval lies below `at_least` or above
+        `at_most`, and otherwise "undecided". If `at_least` and `at_most` are infinite,
         `criterion` and `shown` are "".
     """
     if isinstance(value, Estimate):
@@ -87,7 +88,7 @@ def judge_share(
     """Return a finding about the share of runs in which an event happened, in percent.
 
     `quantity` names the event in words, and `happened` says for each run whether the event
-    happened, shape (runs,). If `is_criterion` is true, the claim asks for a share of at least
+    happened, shape (runs,). If `is_criterion` is true, the claim needs a share of at least
     `MOST_RUNS`; otherwise, the share is for information only.
     """
     at_least = 100 * MOST_RUNS if is_criterion else -inf
@@ -108,8 +109,8 @@ def judge_times(quantity: str, samples: ArrayLike) -> Iterator[Finding]:
 def verdict(findings: Iterable[Finding]) -> str:
     """Return the verdict on a claim in words, from all findings about the claim.
 
-    Findings without a criterion do not count, and an undecided finding counts as a criterion
-    that is not met.
+    Findings without a criterion do not count in the verdict, and an undecided finding counts as
+    a criterion that is not met.
     """
     is_met = [finding["shown"] == "yes" for finding in findings if finding["shown"]]
     if not is_met:
@@ -122,7 +123,7 @@ def verdict(findings: Iterable[Finding]) -> str:
 
 
 def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) -> pd.DataFrame:
-    """Return the table of all findings, with the verdicts on the claims.
+    """Return a table of all findings (measured numbers), with the verdicts on the claims.
 
     The table has a row for each finding about a claim. A claim without findings has one row, in
     which the number of runs is missing.
@@ -157,9 +158,10 @@ def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
 
 
 def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return findings about a claim as a table of texts with the columns of the report.
+    """Return the measured numbers about a claim as a table of texts for the report.
 
-    `rows` are the rows of the claim in the table that the function `table` returns.
+    `rows` are the rows of the claim in the table that the function `table` of this module
+    returns.
     """
     low = rows["low"].map(_three_digits)
     high = rows["high"].map(_three_digits)

@@ -48,7 +48,7 @@ class Batch:
         in_proportion
             Whether to divide the paper's learning rates by n if a network has n times the nodes
             or inputs of the paper's network. With equal learning rates, a larger network learns
-            faster, as more terms of a sum change at the same time.
+            faster, as the sums from which its output is computed have more terms that change.
         direction
             Sign of the plant's gain that each network assumes: -1 (right) or 1 (wrong).
         """
@@ -93,7 +93,7 @@ class Batch:
         """Run a PI controller with the gains `kp` and `ki`, and return the signals of all runs.
 
         If `arguments` does not contain `noise_variance`, all runs of the batch would be equal,
-        so that the controller runs only once.
+        so that the PI controller runs only once.
         """
         batch = self if "noise_variance" in arguments else Batch(1, self.seed)
         return batch.run(PIController(gains["kp"], gains["ki"]), samples, **arguments)
@@ -103,12 +103,12 @@ class Batch:
 class WeightLog:
     """A function that logs the weights of learning networks before each sample of a run."""
 
-    networks: DirectNNController  # a batch of networks, one for each run
-    # An array for each sample, shape (runs, weights).
+    networks: DirectNNController  # the learning networks, one for each run
+    # The weights before each sample so far: an array for each sample, shape (runs, weights).
     weights: list[Array] = field(default_factory=list)
 
     def __call__(self, k: int) -> None:
-        """Append the weights of all networks before they act at sample k."""
+        """Append the weights of all networks, before they act at sample k, to `weights`."""
         arrays = vars(self.networks.weights).values()
         columns = [array.reshape(len(array), -1) for array in arrays]
         self.weights.append(np.hstack(columns, dtype=np.float32))

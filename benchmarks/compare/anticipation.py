@@ -35,18 +35,19 @@ TIMETABLE_SEED = 0  # seed of the first unforeseeable set point, not of an episo
 
 @dataclass(frozen=True)
 class Anticipation:
-    """How much a controller anticipates, and the controller's errors without foresight.
+    """How much a controller anticipates set-point changes, and its errors without foresight.
 
     The errors are mean absolute errors of runs in which nobody can foresee the set point.
 
     Attributes
     ----------
     movement : Estimate
-        Share of a set-point change of the square wave that the output makes before the output
-        can respond to the change.
+        Share of a set-point change that the temperature makes before the temperature can
+        respond to the change, a mean over the changes of the square wave.
     errors : Array
         Mean absolute errors of the controller in runs with unforeseeable set points, degC,
-        shape (members, runs). A controller has a member for each trained network.
+        shape (members, runs). The members of a controller are its trained networks; a
+        controller without trained networks has one member.
     least : float
         Least possible error at unforeseeable set points, degC, a mean over the runs.
     idle : float
@@ -87,8 +88,8 @@ def anticipation(
     set point of the scenario is not a square wave.
 
     `members` has a record of the controller for each trained network, and `trajectories` has
-    the signals of each member in the scenario. Each member has `runs` runs, but the trajectory
-    has a single run if all runs are equal. Run i has the seed `seed + i`.
+    the signals of each member in the scenario. Each member has `runs` runs. If all runs are
+    equal, the trajectory has only one of them. Run i has the seed `seed + i`.
     """
     if scenario.parameters.setpoint != "square":
         return None
@@ -105,7 +106,7 @@ def anticipation(
 
 
 def follows_setpoint(trajectories: Sequence[Trajectory]) -> bool:
-    """Return whether the mean |error| is smaller than with an output of always 0 degC."""
+    """Return whether a controller's mean |error| is smaller than with an output of 0 degC."""
     errors = np.concatenate([np.abs(batch.next_error).ravel() for batch in trajectories])
     setpoints = np.concatenate([np.abs(batch.setpoint).ravel() for batch in trajectories])
     return bool(errors.mean() < setpoints.mean())
@@ -114,21 +115,23 @@ def follows_setpoint(trajectories: Sequence[Trajectory]) -> bool:
 def movement_before_changes(
     scenario: Scenario, trajectories: Sequence[Trajectory]
 ) -> Estimate | None:
-    """Return how far the output moves to a new set point before a response is possible.
+    """Return how far the output moves to a new set point before it can respond to the change.
 
-    The movement is a share of the set-point change, as a mean over all changes. The result is
-    None if the set point changes too often for measuring the movement.
+    The result is a share of the set-point change, a mean over all changes and all runs. The
+    result is None if the set point changes too often for measuring the movement.
 
     In a plant with a delay of d samples, a flow first affects the output d + 1 samples later.
-    Hence the output in the first d + 1 samples after a set-point change does not depend on the
-    flows at or after the change. The movement is the mean output in the d + 1 samples after the
-    change, minus the mean output in a window of d + 1 samples before the change. Of all windows
-    between a quarter and three quarters of the time for which the old set point is constant,
-    the movement uses the window in which the mean output is nearest to the new set point. A
+    Hence the output in the first d + 1 samples after a set-point change, where d is the delay,
+    does not depend on the flows at or after the change. The movement is the mean output in the
+    d + 1 samples after the change, minus the mean output in a window of d + 1 samples before
+    the change, where d is the delay of the plant. The window lies between a quarter and three
+    quarters of the time for which the old set point is constant. Of all such windows, the
+    movement uses the window in which the mean output is nearest to the new set point. A
     controller whose output oscillates around the old set point, or has not reached the old set
     point, has little or no movement, and does not count as a controller that anticipates.
 
-    `scenario` has a square wave, and `trajectories` has the signals of each member's runs.
+    The set point of `scenario` must be a square wave, and `trajectories` has the signals of all
+    runs of each of the controller's members.
     """
     window = int(scenario.parameters.range_of("delay")[0]) + 1
     setpoint = trajectories[0].setpoint[:, 0]
@@ -160,10 +163,10 @@ def run_surprised(
 ) -> Anticipation:
     """Run a controller with set points that nobody can foresee, and return the errors.
 
-    `scenario` has a square wave, `members` are the records of the controller's members,
-    `movement` is the result of `movement_before_changes`, and `seeds` has the shape (runs,).
-    If `are_equal` is true, runs with the same set point are equal, so that each member runs
-    only once with each set point.
+    The set point of `scenario` must be a square wave, `members` are the records of the
+    controller's members, `movement` is the result of `movement_before_changes`, and `seeds` has
+    the seed of each run, shape (runs,). If `are_equal` is true, runs with the same set point
+    are equal, so that each member runs only once with each set point.
     """
     errors = []
     least_errors: list[float] = []

@@ -37,7 +37,8 @@ Anticipations = Mapping[tuple[str, str], Anticipation]
 class Result:
     """The results of one controller in one scenario.
 
-    A controller has a member for each trained network, and each member has its own runs.
+    The members of a controller are its trained networks, and each member has its own runs. A
+    controller without trained networks has one member.
 
     Attributes
     ----------
@@ -154,8 +155,8 @@ class Scale:
 def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     """Return the least possible errors in a scenario, as means over episodes.
 
-    As bounds take long to compute, the means are over the first `runs` episodes, but at most
-    over `EPISODES` episodes. Episode i has the seed `seed + i`.
+    As least possible errors take long to compute, the means are over the first `runs` episodes,
+    but at most over `EPISODES` episodes. Episode i has the seed `seed + i`.
 
     Raises
     ------
@@ -169,8 +170,10 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
         **scenario.arguments,
     }
     least = least_possible(**arguments)
-    # The method `score` raises a ValueError if an idle valve is as good as any controller.
+    # The method `score` is called only because it raises a ValueError if an idle valve is as
+    # good as any controller. The scores themselves are computed in `estimate`.
     least.score(0.0)
+    # The kind "preview" is for controllers that know all future set points.
     preview = least_possible(kind="preview", **arguments)
     return Scale(scenario, least, preview.value)
 
@@ -185,13 +188,14 @@ def estimate(
     runs : pandas.DataFrame
         Table with a row for each run, and the columns `scenario`, `agent` (the controller),
         `policy` (the number of the controller's member), `seed` and `mae` (the mean absolute
-        error of the run, degC). The controller in the first row is the reference with which all
-        other controllers are compared.
+        error of the run, degC). The controller in the first row is the reference controller,
+        with which all other controllers are compared.
     scales : mapping
         Least possible errors by the name of the scenario. A scenario that is not in `scales` is
         left out of the result.
     anticipations : mapping
-        `Anticipation` by the names of scenario and controller, if the controller anticipates.
+        `Anticipation` of each controller that acts before set-point changes, by the names of
+        the scenario and the controller.
 
     Returns
     -------
@@ -207,11 +211,11 @@ def estimate(
         - `scores`: an array with the score of each run, shape (members, runs). If the
           controller anticipates, the scores are from runs with unforeseeable set points;
         - `mark`: "‡" if the controller anticipates, and otherwise "";
-        - `difference`: the mean over the runs of the controller's error minus the reference's
-          error in the same run, degC, an `Estimate`;
+        - `difference`: the mean over the runs of the controller's error minus the error of the
+          reference controller in the same run, degC, an `Estimate`;
         - `improvement`: the share of the runs in which the controller's error is smaller than
-          the reference's error, an `Estimate`. A run in which both controllers have equal
-          errors counts as half a run.
+          the error of the reference controller, an `Estimate`. A run in which both controllers
+          have equal errors counts as half a run.
     """
     reference = runs["agent"].iloc[0]
     rows = []
@@ -249,7 +253,7 @@ def estimate(
 def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
     """Return the errors of each controller, degC, shape (members, runs), by controller name.
 
-    `runs` has the rows of one scenario in the table `Result.runs`.
+    `runs` is a table like `Result.runs`, with the rows of one scenario.
     """
     errors = {}
     for agent, rows in runs.groupby("agent", sort=False):

@@ -104,8 +104,8 @@ def scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
 
     The axis begins at the highest of `SCORE_TICKS` below all `scores`, and ends at the lowest
     tick above all `scores`. If a score is below the first of `SCORE_TICKS`, the label of the
-    first tick begins with `AT_MOST`. If a score is above the last of `SCORE_TICKS`, the label
-    of the last tick begins with `AT_LEAST`.
+    first tick begins with the sign `AT_MOST`. If a score is above the last of `SCORE_TICKS`,
+    the label of the last tick begins with the sign `AT_LEAST`.
     """
     labels = [f"{score:g}" for score in SCORE_TICKS]
     if min(scores) < LOWEST_SCORE:
@@ -195,8 +195,8 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
     """Draw the applied flow of the first run, the dead zone, and the limits of the flow.
 
     `rows` are the rows of one controller in the argument `responses` of `plot_responses`. If
-    the dead zone of the plant has a range, the smallest dead zone is drawn. If a limit of the
-    flow has a range, the widest limit is drawn.
+    the dead zone of the plant is a range of values, the picture shows the smallest value. If a
+    limit of the flow is a range, the picture shows the widest limit.
     """
     dead_zone = plant.range_of("dead_zone")[0]
     axes.axhspan(-dead_zone, dead_zone, **DEAD_ZONE)
@@ -208,7 +208,7 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
 
 
 def _legend_of_responses(responses: pd.DataFrame, plant: Parameters) -> dict[str, Any]:
-    """Return the legend of `plot_responses`: matplotlib's lines and patches by text."""
+    """Return the legend of `plot_responses`: matplotlib's lines and patches, by their texts."""
     runs_differ = bool((responses["output_p90"] > responses["output_p10"]).any())
     run = Line2D([], [], color="black", linewidth=1.2)
     band = Patch(color="black", **BAND)

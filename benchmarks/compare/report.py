@@ -94,7 +94,7 @@ class Comparison:
     Attributes
     ----------
     controllers : mapping
-        Record of each controller by name.
+        Record (`ControllerSpec`) of each controller by name.
     results : sequence of Result
         Results of each controller in each scenario, from all tasks that have finished.
     scales : mapping
@@ -104,11 +104,12 @@ class Comparison:
     estimates : pandas.DataFrame
         Table with a row for each scenario and controller, from `comparison.estimate`.
     anticipations : mapping
-        `Anticipation` by the names of scenario and controller, if the controller anticipates.
+        `Anticipation` of each controller that acts before set-point changes, by the names of
+        the scenario and the controller.
     misfits : mapping
         Sentences that say why a controller does not fit a plant, by the controller's name.
     scores : mapping
-        Overall score of each controller by name, in the order of the controllers in tables.
+        Overall score of each controller by name, in the order in which tables list controllers.
     """
 
     controllers: Mapping[str, ControllerSpec]
@@ -127,7 +128,7 @@ class Comparison:
 
     @property
     def pictured(self) -> list[str]:
-        """The names of the controllers that are drawn over time, the best first.
+        """Names of the controllers whose temperature and flow are drawn, the best first.
 
         The drawn controllers are the `ranked` controllers, or all controllers if none is
         ranked. Of more than `MOST_PICTURED` controllers, only controllers whose record has
@@ -150,8 +151,8 @@ def write(
     """Write the CSV files, pictures and report of a comparison, and print the main tables.
 
     A scenario whose least possible errors are not in `scales` is written to the CSV files, but
-    not to the report. `controllers` has the record of each controller by name, and `origin` is
-    the provenance of the results, as `provenance.origin` returns it.
+    not to the report. `controllers` has the record (`ControllerSpec`) of each controller by
+    name, and `origin` is the provenance of the results, as `provenance.origin` returns it.
     """
     runs = pd.concat([result.runs for result in results], ignore_index=True)
     write_numbers(folder / "runs.csv", runs)
@@ -210,7 +211,7 @@ def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: 
 
 
 def sections(comparison: Comparison) -> list[Section]:
-    """Return the sections of the report. A section with an empty table is left out."""
+    """Return the sections of a comparison's report, without sections whose table is empty."""
     reference = label(str(comparison.runs["agent"].iloc[0]))
     scenarios = [scale.scenario for scale in comparison.scales.values()]
     candidates = [
@@ -268,9 +269,10 @@ def sections(comparison: Comparison) -> list[Section]:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return sentences on controllers that are not ranked, or are scored in other runs.
+    """Return sentences on controllers that are not ranked, or that anticipate changes.
 
-    Notes on users' own controllers, such as a note on a missing environment, come first.
+    The notes that users' own controllers have, such as a note on a missing environment, come
+    first.
     """
     texts = {
         str(policy["note"])
@@ -322,7 +324,10 @@ def ratio_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts with least possible errors and error ratios in each scenario.
 
     The first two rows have the least possible errors without and with knowledge of future set
-    points, degC. Each row below the first two rows has the error ratios of one controller.
+    points, degC. Each further row has the error ratios of one controller. The mark * follows a
+    least possible error of the kind "reference", which is the error for set-point changes that
+    come as a surprise: controllers that have learnt the times of the changes can have a smaller
+    error.
     """
     bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
     for name, scale in comparison.scales.items():
@@ -337,7 +342,9 @@ def ratio_table(comparison: Comparison) -> pd.DataFrame:
 def anticipation_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts on the controllers that act before a square wave changes.
 
-    The table has a row for each scenario and controller in `comparison.anticipations`.
+    The table has a row for each scenario and controller in `comparison.anticipations`. The
+    column "moved before the change (%)" has the share of a set-point change that the
+    temperature makes before the temperature can respond to the change.
     """
     estimates = comparison.estimates
     rows = []
@@ -361,9 +368,10 @@ def anticipation_table(comparison: Comparison) -> pd.DataFrame:
 def difference_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts that compares each controller with the reference controller.
 
-    A cell has the mean of the controller's error minus the reference's error, degC, and the
-    share of the runs in which the controller has the smaller error. If a comparison has only
-    one controller, the table is empty.
+    The reference controller is that of the first row of `comparison.runs`. A cell has the mean
+    of a controller's error minus the error of the reference controller, degC, and the share of
+    the runs in which the controller has the smaller error. If a comparison has only one
+    controller, the table is empty.
     """
     if "difference" not in comparison.estimates:
         return pd.DataFrame()
@@ -387,7 +395,7 @@ def table_by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.
 
 
 def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of texts with the parts of the mean error in the scenario `hard`, degC.
+    """Return a table of texts that splits the mean error on the preset `hard` into parts, degC.
 
     The table has a column for each of `PARTS_OF_ERROR`, and a row for each controller, the
     smallest mean error first.
@@ -419,7 +427,7 @@ def cases_table(scenarios: Sequence[Scenario]) -> pd.DataFrame:
 def costs_table(
     results: Sequence[Result], controllers: Mapping[str, ControllerSpec], scenario: Scenario
 ) -> pd.DataFrame:
-    """Return a table of texts on knowledge, robustness and costs, a row for each controller.
+    """Return a table of texts on each controller's prior knowledge, robustness and costs.
 
     The robustness of linear controllers is computed with the nominal plant of `scenario`.
     `controllers` has the record of each controller by name.

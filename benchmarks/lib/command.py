@@ -3,7 +3,7 @@
 The module `benchmarks.NAME` defines a dataclass `Options`, whose docstrings are the text of
 `--help`, and a function `work(options)`, which writes results and returns the last line to
 print. The line `main = command("NAME", Options, work)` makes the command. Slow packages such as
-pandas are imported inside `work`, so that `--help` is quick.
+pandas are imported inside the function `work`, so that `--help` is quick.
 """
 
 import errno
@@ -162,7 +162,7 @@ def command(
     Parameters
     ----------
     name
-        NAME, such as "compare".
+        Name of the command, such as "compare".
     declared
         Dataclass whose fields are the options of the command.
     work

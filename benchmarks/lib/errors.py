@@ -39,10 +39,10 @@ class UnfinishedError(RuntimeError):
 
 
 class NoBoundError(ValueError):
-    """A scenario has no lower bound on the control error, or none of the requested kind.
+    """A scenario has no least possible error of the requested kind.
 
-    For example, a lower bound of the kind "reference" exists only if the plant settles before
-    each change of the set point.
+    For example, a least possible error of the kind "reference" exists only if the plant settles
+    before each change of the set point.
     """
 
 

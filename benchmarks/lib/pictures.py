@@ -111,10 +111,11 @@ def excess(ratios: ArrayLike) -> NDArray[np.float64]:
 
 
 def scale_by_ratio(axes: Axes, ratios: ArrayLike) -> None:
-    """Make the y axis of `excess(ratios)` logarithmic, with error ratios at the ticks.
+    """Make the y axis of a panel logarithmic in the error ratio minus 1, with ratios as ticks.
 
     The ends of the axis follow from `ratios`, which are all error ratios in the panel. If an
-    error ratio is below `RATIO_FLOOR`, the label of the lowest tick begins with `AT_MOST`.
+    error ratio is below `RATIO_FLOOR`, the label of the lowest tick begins with the sign
+    `AT_MOST`.
     """
     from matplotlib.ticker import NullLocator
 

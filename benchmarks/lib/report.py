@@ -105,8 +105,8 @@ def _in_markdown(section: Section, folder: Path) -> list[str]:
 def escape(text: object) -> str:
     """Return one line of Markdown that a reader sees as the plain text `str(text)`.
 
-    Users choose names of controllers, files and columns. Without `escape`, a name could end a
-    cell of a table, or bring HTML and links into the page.
+    Users choose the names of controllers, files and columns in a report. Without `escape`, such
+    a name could end a cell of a table, or bring HTML and links into the report.
     """
     escaped = " ".join(str(text).split()).replace("\\", "\\\\")
     escaped = escaped.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

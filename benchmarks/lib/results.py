@@ -42,9 +42,10 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
     target
         Folder that the user has chosen by the option `--out`.
     conditions
-        Everything that the results depend on, as returned by `conditions_of`. If an unfinished
-        run with equal conditions has left a folder, `results_folder` yields that folder with
-        the results in it. If `conditions` is None, the yielded folder is always empty.
+        Everything that the results of the command depend on, as returned by `conditions_of`. If
+        an unfinished run with equal conditions has left a folder, `results_folder` yields that
+        folder with the results in it. If `conditions` is None, the yielded folder is always
+        empty.
 
     Raises
     ------
@@ -82,10 +83,10 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
 
 
 def _lock(final: Path) -> AbstractContextManager[object]:
-    """Lock the folder `final`, and return a context manager that unlocks it at the end.
+    """Lock the folder `final`, and return a context manager that unlocks the folder.
 
-    The lock is a hidden file beside the folder `final`, which need not exist. If the process is
-    killed, the operating system releases the lock.
+    The lock is a hidden file beside the folder `final`. The folder `final` need not exist. If
+    the process is killed, the operating system releases the lock.
 
     Raises
     ------
@@ -186,8 +187,8 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
     """Return everything that the results of a command depend on, as a dict for JSON.
 
     The dict has the name of the command, the options, a hash of the source code, and the
-    versions of Python and of packages. If the dicts of two runs are equal, the results of the
-    two runs are equal.
+    versions of Python and of packages. If the dicts of two runs of a command are equal, the
+    results of the two runs are equal.
 
     Parameters
     ----------
@@ -208,7 +209,7 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
 
 
 def _relevant(options: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return pairs of name and value as a dict, without the names in `WITHOUT_INFLUENCE`."""
+    """Return options as a dict, without those on which no result depends."""
     return {name: value for name, value in options if name not in WITHOUT_INFLUENCE}
 
 
@@ -229,10 +230,10 @@ def save_arrays(path: Path, result: Mapping[str, Any]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, Any]:
-    """Return the numbers and arrays, by name, that `save_arrays` has saved in the NPZ `path`.
+    """Return the numbers and arrays, by name, of an NPZ file that `save_arrays` has written.
 
-    NumPy raises a ValueError for an NPZ
-    file with pickled objects, since loading pickled objects could run foreign code.
+    NumPy raises a ValueError for an NPZ file with pickled objects, since loading pickled
+    objects could run foreign code.
     """
     result = {}
     with np.load(path) as arrays:
@@ -246,7 +247,8 @@ def load_arrays(path: Path) -> dict[str, Any]:
 class KeptResults:
     """Files with the results of finished tasks, from which an interrupted run can continue.
 
-    When a command has finished, the function `results_folder` removes these files.
+    When a command has finished, the function `results_folder` removes the files with the
+    results of tasks.
 
     Attributes
     ----------

@@ -38,9 +38,9 @@ class Estimate:
     def __format__(self, form: str) -> str:
         """Return the estimate as text, "value (low to high)".
 
-        The argument `form` is the format of each number, such as ".3f". If `low` and `high`
-        have equal texts, the text of the estimate is "value". If `high` is infinite, the text
-        of the estimate is "value (one run)".
+        The argument `form` is the format of each number, such as ".3f". If the two ends of the
+        interval have equal texts, the text of the estimate is only "value". If the upper end of
+        the interval is infinite, the text of the estimate is "value (one run)".
         """
         value = as_text(self.value, form)
         low = as_text(self.low, form)
@@ -110,13 +110,13 @@ def share(happened: NDArray[np.bool_]) -> Estimate:
 
 
 def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
-    """Return the mean over tasks, members and runs, with an interval from a bootstrap.
+    """Return the mean over tasks, members and runs, with a 95 % interval from a bootstrap.
 
     Members are the networks of one controller that were trained with different seeds. As all
     members have the same noise in run i, members and runs are resampled independently: a
     resample consists of all pairs of a resampled member and a resampled run (Owen 2007, "The
-    pigeonhole bootstrap", Annals of Applied Statistics 1, 386-411). Tasks are not resampled. If
-    the means of five members differ far more than the runs of a member, the 95 % interval
+    pigeonhole bootstrap", Annals of Applied Statistics 1, 386-411). Tasks are not resampled.
+    With five members whose means differ far more than the runs of a member, the 95 % interval
     contains the true mean in only 82 % of the cases.
 
     Parameters

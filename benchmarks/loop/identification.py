@@ -9,7 +9,8 @@ Box-Jenkins model) describes the temperature as the sum of three parts:
   measured disturbances, and the responses to steps of unmeasured loads;
 - coloured noise C(z^-1) / D(z^-1) xi, with two polynomials C and D and the white noise xi.
 
-The fit minimises the sum of the squared prediction errors, which are estimates of xi.
+The fit minimises the sum of the squared prediction errors, which are estimates of the white
+noise xi.
 """
 
 from dataclasses import dataclass, replace
@@ -127,7 +128,7 @@ def stable_polynomial(first: float, second: float) -> Array:
 
 
 class Unknowns(NamedTuple):
-    """The parameters of a model that the fit estimates by nonlinear least squares."""
+    """The parameters of a plant's model that are estimated by nonlinear least squares."""
 
     gain: float  # steady-state gain from flow to temperature, degC per t/h
     delay: float  # delay of the flow response, samples, not necessarily an integer
@@ -150,7 +151,7 @@ class Unknowns(NamedTuple):
         return self.ratio * self.slow
 
     def respond(self, flows: Array) -> Array:
-        """Return the output of the delay and the lags, with gain 1, for `flows - flows[0]`.
+        """Return the model's response to the input `flows - flows[0]`, with the gain 1.
 
         `flows` and the result are in t/h and have the shape (rows, ...).
         """
@@ -185,11 +186,12 @@ class Fit:
     standard_errors: Unknowns | None = None
 
     def whiten(self, signals: Array) -> Array:
-        """Return the means of signals over blocks of successive rows, filtered by D / C.
+        """Return means of signals over blocks of rows, filtered so that noise becomes white.
 
-        The filter D / C turns noise of the noise model C / D into white noise. The result is
-        multiplied by `SETTLING_WEIGHT` in the first `SETTLING_BLOCKS` blocks. `signals` has the
-        shape (rows, ...), and the result has the shape (blocks, ...).
+        The filter is D / C, where C / D is the filter of the noise model, which turns white
+        noise into coloured noise. The result is multiplied by `SETTLING_WEIGHT` in the first
+        `SETTLING_BLOCKS` blocks. `signals` has the shape (rows, ...), and the result has the
+        shape (blocks, ...).
         """
         unknowns = self.unknowns
         c = stable_polynomial(unknowns.first_of_c, unknowns.second_of_c)
@@ -210,10 +212,10 @@ class Fit:
 
     @cached_property
     def background(self) -> Array:
-        """Signals whose weighted sum is the temperature without noise and flow response.
+        """Signals whose weighted sum is the temperature without noise and response to the flow.
 
-        The weights are `coefficients`. The array has the shape (rows, terms), and the first
-        column is 1 in all rows.
+        The weights are `coefficients`. The returned array has a signal in each column, shape
+        (rows, terms), and the first column is 1 in all rows.
         """
         slow, fast = self.unknowns.slow, self.unknowns.fast
         rows = np.arange(len(self.log.flow), dtype=np.float64)
@@ -232,7 +234,7 @@ class Fit:
 
     @cached_property
     def coefficients(self) -> Array:
-        """Weights of the columns of `background`, by linear least squares, shape (terms,)."""
+        """Weights of the signals in `background`, fitted by least squares, shape (terms,)."""
         terms = self.whiten(self.background)
         target = self.whiten(self.log.temperature - self.flow_response)
         lengths = np.linalg.norm(terms, axis=0) + TINY
@@ -246,7 +248,7 @@ class Fit:
 
     @cached_property
     def errors(self) -> Array:
-        """The prediction error of each block of successive rows, degC, shape (blocks,)."""
+        """The prediction error of each block of rows, degC, shape (blocks,)."""
         return self.whiten(self.log.temperature - self.simulated)
 
     @property
@@ -266,21 +268,22 @@ class Fit:
         return float(self.errors @ self.errors + TINY)
 
     def improvement(self, squares: Array | float) -> Array:
-        """Return by how much other fits are better than this fit; a negative value is worse.
+        """Return by how much other fits to the log are better than this fit; negative if worse.
 
-        The value is twice the logarithm of a ratio: the likelihood of another fit divided by
+        The result is twice the logarithm of a ratio: the likelihood of another fit divided by
         the likelihood of this fit. `squares` has the sums of squared prediction errors of the
         other fits, degC^2, and the result has the shape of `squares`.
         """
         return np.asarray(len(self.errors) * np.log(self.squares / (squares + TINY)))
 
     def try_candidates(self, target: Array, candidates: Array) -> tuple[Array, Array]:
-        """Fit a signal by a weighted sum of `background` and one candidate, for each candidate.
+        """Fit a signal by the signals in `background` and one further signal, a candidate.
 
-        `target` is the signal, degC, shape (rows,). `candidates` has a candidate in each
-        column, in any unit, shape (rows, candidates). Two arrays of shape (candidates,) are
-        returned: the sums of the squared prediction errors, degC^2, and the factors of the
-        candidates, degC per unit.
+        There is a fit for each candidate: a weighted sum of the candidate and of all signals in
+        `background` is fitted to `target`, the signal, degC, shape (rows,). `candidates` has a
+        candidate in each column, in any unit, shape (rows, candidates). Two arrays of shape
+        (candidates,) are returned: the sum of the squared prediction errors of each fit,
+        degC^2, and the weight of the candidate in each fit, degC per unit of the candidate.
         """
         # Regress the target and the candidates on the columns of `background`. The residual of
         # the target is then fitted by the residual of one candidate.
@@ -296,7 +299,7 @@ class Fit:
         return errors @ errors - products**2 / powers, products / powers
 
     def refined(self, evaluations: int = 25) -> "Fit":
-        """Return this fit with `unknowns` improved by nonlinear least squares.
+        """Return this fit with its parameters `unknowns` improved by nonlinear least squares.
 
         The search starts from the values in `unknowns`, and finds a local minimum of the sum of
         squared prediction errors. The returned fit has `standard_errors`. `evaluations` is the
@@ -339,8 +342,8 @@ def possible_zones(
 
     `flow` is the flow of the log, t/h, shape (rows,). `operating_flow` is the centre of all
     dead zones, t/h; if `operating_flow` is None, the centres lie in the whole range of the
-    flow. If `applied` is true, the flow was measured behind the valve, and all half widths
-    are 0.
+    flow. If `applied` is true, the flow was measured behind the valve, and all returned dead
+    zones have the half width 0.
     """
     centres = np.linspace(flow.min(), flow.max(), GRID_POINTS)
     if operating_flow is not None:
@@ -388,11 +391,11 @@ def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
 
 
 def try_zones(fit: Fit) -> pd.DataFrame:
-    """Return a table of fits like `fit`, one row for each dead zone in `fit.zones`.
+    """Return a table of fits with other dead zones than `fit`, a row for each of `fit.zones`.
 
     For each dead zone, only the gain and `Fit.coefficients` are fitted again. The columns of
     the table are `centre` and `half_width` of the dead zone (t/h), the new `gain` (degC per
-    t/h), and `improvement`, which is the result of `Fit.improvement` for the new fit.
+    t/h), and `improvement`, which is the result of `fit.improvement` for the new fit.
     """
     passed = np.column_stack([zone.passed(fit.log.flow) for zone in fit.zones])
     responses_with_gain_1 = fit.unknowns.respond(passed)
@@ -406,7 +409,7 @@ def with_zone(fit: Fit) -> Fit:
 
     If no dead zone improves a fit without a dead zone by `IMPROVEMENT_BY_DEAD_ZONE`, the half
     width of the new dead zone is 0. The gain, the delay, the time constants and the noise model
-    are not changed.
+    of `fit` are not changed.
     """
     table = try_zones(fit)
     most = table.improvement.max()
@@ -470,9 +473,10 @@ def identify(log: Log, zones: list[DeadZone], end_row: int | None = None) -> Fit
 def estimates(fit: Fit) -> pd.DataFrame:
     """Return a table of the plant's estimated parameters with 95 % confidence intervals.
 
-    The rows are `delay` (samples), `dead_zone` (the half width, t/h), `gain` (degC per t/h) and
-    `time_constant` (the larger time constant, s). The columns are `value` and the ends of the
-    interval, `low` and `high`. `fit` must be a result of `Fit.refined` or `identify`.
+    The rows of the table are `delay` (samples), `dead_zone` (the half width, t/h), `gain` (degC
+    per t/h) and `time_constant` (the larger time constant, s). The columns of the table are
+    `value`, `low` and `high`, where `low` and `high` are the ends of the confidence interval.
+    `fit` must be a result of `Fit.refined` or `identify`, which compute standard errors.
     """
     values = fit.unknowns
     margins = Unknowns(*(INTERVAL * np.array(fit.standard_errors)))
@@ -514,15 +518,17 @@ def explained_share(fit: Fit) -> float:
 
 
 def polynomials(fit: Fit, delay: int) -> tuple[Array, Array, Array, float]:
-    """Return the polynomials A, B, C of equation (28), and the variance of xi, degC^2.
+    """Return the polynomials A, B, C of a plant, and the variance of its noise xi, degC^2.
 
-    The arrays A and C begin with the coefficient of z^0. The array B begins with the
-    coefficient of z^-1, in degC per t/h. `delay` is the delay of equation (28), samples.
+    The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k),
+    with temperature y, applied flow u_a, delay d = `delay` (samples) and white noise xi. The
+    returned arrays A and C begin with the coefficient of z^0. The returned array B begins with
+    the coefficient of z^-1, in degC per t/h.
 
-    If the delay of the fit is from `delay` to `delay + 1`, A and B reproduce the flow response
-    of the fit exactly. If the delay of the fit is shorter than `delay`, B leaves out the
-    response before the sample `delay + 1`. C and the variance of xi are fitted to the recorded
-    temperature minus the simulated temperature.
+    If the delay of the fit is from `delay` to `delay + 1`, the polynomials A and B reproduce
+    the fit's response to the flow exactly. If the delay of the fit is shorter than `delay`, the
+    polynomial B leaves out the response before the sample `delay + 1`. The polynomial C and the
+    variance of xi are fitted to the recorded temperature minus the simulated temperature.
     """
     unknowns = fit.unknowns
     lags = np.array([unknowns.slow, unknowns.fast])

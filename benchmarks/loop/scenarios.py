@@ -135,7 +135,7 @@ class PlantOptions:
         return ", ".join(filter(None, [self.preset, file, *self.set]))
 
     def command_line(self) -> list[str]:
-        """Return the words of a command line that choose this plant: "--preset", "hard"."""
+        """Return the words of a command line that choose this plant: ["--preset", "hard"]."""
         words: list[str] = []
         if self.preset:
             words += ["--preset", self.preset]
@@ -148,9 +148,9 @@ class PlantOptions:
     def cases(self, default: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
         """Return the cases of the chosen plant by name, or `default` if no plant is chosen.
 
-        The cases are "square" and "constant", with the set points in `SETPOINTS`. If the user's
-        arguments of the plant define a set point, the only case is "run", with the user's set
-        point.
+        The cases of a chosen plant are "square" and "constant", with the set points in
+        `SETPOINTS`. If the user's arguments of the plant define a set point, the only case is
+        "run", with the user's set point.
         """
         arguments = self.arguments()
         if not self.name:
@@ -257,7 +257,7 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
     If a variation has twice the delay of the paper's plant, then the returned variation has
     twice the delay of the other plant. Dead zones, gain factors and time constant factors are
     scaled in proportion to the values of the two plants. Noise variances are scaled in
-    proportion to the square of the temperature change by half the range of the flow.
+    proportion to the square of the temperature change that half the range of the flow causes.
 
     `nominal_plant` has the environment's arguments for the other plant. A variation is a dict
     of the arguments of the environment that differ from a nominal plant.
@@ -276,11 +276,11 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
 
 
 def _scales(plant: Parameters) -> dict[str, float]:
-    """Return the scale of a plant for each argument in `SPANS`: the value of the argument.
+    """Return a number for each argument in `SPANS`, with which `around` scales the argument.
 
-    If an argument of the plant is a range, the scale is the middle of the range. The scale of
-    the noise variance is the square of the temperature change by half the range of the flow,
-    degC^2, because the noise variance of a plant may be 0.
+    The number is the argument's value for the plant, or the middle of the argument's range. For
+    the noise variance, which may be 0, the number is the square of the temperature change that
+    half the range of the flow causes, degC^2.
     """
     model = nominal(plant)
     flow_change = (model.numbers.u_max - model.numbers.u_min) / 2.0  # t/h

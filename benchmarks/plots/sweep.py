@@ -1,8 +1,8 @@
 """Draw the results of a sweep, which runs controllers on many plants.
 
-If the plants differ only in delay and gain, the picture has maps over delay and gain.
-Otherwise, the picture has a curve of the sorted error ratios for each controller. An error
-ratio is a mean error divided by the least possible mean error.
+If the plants differ only in delay and gain, the picture has maps of the error ratio over delay
+and gain. Otherwise, the picture has a curve of the sorted error ratios for each controller. An
+error ratio is a mean error divided by the least possible mean error.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ from benchmarks.lib.pictures import (
 from mptc_gym import Parameters
 
 NEAR_RATIO = 1.05  # largest error ratio that counts as near the least possible error
-MARKED_SHARE = 0.5  # A plant has a mark in the map if at least this share of its runs fail.
+# A plant has a mark in the map if the loop oscillates, or control is no better than an idle
+# valve, in at least this share of the runs.
+MARKED_SHARE = 0.5
 MOST_COLUMNS = 3  # number of maps in a row
 RATIO_CLASSES = 1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0  # error ratios at which the colour changes
 COLOUR_MAP = "viridis_r"  # light for small error ratios, dark for large ones
@@ -50,9 +52,10 @@ NOMINAL_MARK: Any = {"color": "black", "marker": "+", "ms": 12, "mew": 1.8, "lin
 
 
 def draw(runs: pd.DataFrame, path: Path, nominal: Parameters) -> None:
-    """Draw the error ratios of a sweep as maps, or as curves of the sorted error ratios.
+    """Draw the error ratio of each controller on each plant, as maps or as sorted curves.
 
-    Maps are drawn if the plants differ only in delay and gain.
+    An error ratio is the mean error of a controller on a plant divided by the least possible
+    error. Maps are drawn if the plants differ only in delay and gain.
 
     Parameters
     ----------
@@ -89,7 +92,7 @@ def plant_medians(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
-    """Draw a curve of the sorted error ratios of the plants for each controller.
+    """For each controller, draw a curve of its error ratios on all plants, sorted by size.
 
     Plants whose least possible error is unknown have no error ratio, and are left out of the
     curves.
@@ -196,10 +199,10 @@ def map_finding(plants: pd.DataFrame) -> str:
 
 
 def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) -> None:
-    """Draw a cell of one controller's map for each plant, with marks where control fails.
+    """Draw one controller's map: a cell for each plant, with marks where control fails.
 
     `plants` are the controller's rows of the table that `plant_medians` returns, and `classes`
-    gives the class of colours of an error ratio.
+    assigns a colour to each range of error ratios.
     """
     cells = plants.pivot(index="gain_factor", columns="delay", values=["ratio", "useless"])
     ratios = cells["ratio"]
@@ -215,7 +218,7 @@ def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) ->
 
 
 def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
-    """Return the legend of the maps: matplotlib's artists by text.
+    """Return the legend of the maps: matplotlib's lines and patches, by their texts.
 
     The legend has only marks that occur in the maps.
     """
