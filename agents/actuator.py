@@ -70,7 +70,7 @@ def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
         Half width of the dead zone in the unit of `command`; a number, or an array that
         broadcasts against `command`.
     xp
-        The array module of `command`: NumPy or PyTorch.
+        Module that computes with `command`: `numpy` for an array, `torch` for a tensor.
     """
     magnitude = abs(command)
     edge_or_0 = edge * xp.sign(command) * (magnitude >= edge / 2.0)

@@ -1,9 +1,9 @@
 """Identify the delay, time constant and gain of n plants by a bank of candidate models.
 
-All quantities are dimensionless, so that a bank suits any plant. Flows are divided by half the
-flow range, (u_max - u_min) / 2. Temperatures are divided by the steady temperature change that
-half the flow range causes according to the step test. Times are divided by the sampling
-interval. A positive dimensionless flow raises the temperature.
+All quantities are dimensionless, so that a bank of candidate models suits any plant. Flows are
+divided by half the flow range, (u_max - u_min) / 2. Temperatures are divided by the steady
+temperature change that half the flow range causes according to the step test. Times are divided
+by the sampling interval. A positive dimensionless flow raises the temperature.
 
 The last axis of every array is the plant: arrays have the shape (n,), (time constants, n) or
 (delays, time constants, n), for n plants.
@@ -83,11 +83,12 @@ class Prior:
 
 
 def model_coefficients(time_constants: Array) -> tuple[Array, Array, Array, Array]:
-    """Return a1, a2, b1 and b2 of s(k) = a1 s(k-1) + a2 s(k-2) + b1 f(k-1) + b2 f(k-2).
+    """Return the coefficients a1, a2, b1 and b2 of plant models with gain 1 and no delay.
 
-    The equation for s(k) is a plant model with the flow f as the input, the output s, a gain of
-    1 and no delay. The fast pole and the ratio b1 / b2 are taken from equation (28) of the
-    paper. `time_constants` are in samples, and each result has the shape of `time_constants`.
+    The equation of a model is s(k) = a1 s(k-1) + a2 s(k-2) + b1 f(k-1) + b2 f(k-2), where f is
+    the flow and s the output. The fast pole and the ratio b1 / b2 are taken from equation (28)
+    of the paper. `time_constants` are in samples, and each coefficient has the shape of
+    `time_constants`.
     """
     pole = np.exp(-1.0 / time_constants)
     sum_of_b = (1.0 - pole) * (1.0 - FAST_POLE)
@@ -96,7 +97,7 @@ def model_coefficients(time_constants: Array) -> tuple[Array, Array, Array, Arra
 
 
 class UndelayedModels:
-    """Models of n plants with a gain of 1 and no delay, one model for each time constant.
+    """Models with a gain of 1 and no delay, one for each time constant of each of n plants.
 
     The function `model_coefficients` states the equation of a model. All models start with the
     output 0.
@@ -106,7 +107,8 @@ class UndelayedModels:
     time_constants
         Time constants of the models, samples, shape (time constants, n).
     convert
-        Function that converts a NumPy array: `torch.from_numpy` to compute in PyTorch.
+        Function that converts NumPy arrays to the arrays with which the models are computed,
+        such as `torch.from_numpy`.
 
     Attributes
     ----------
@@ -121,6 +123,8 @@ class UndelayedModels:
     def __init__(
         self, time_constants: Array, convert: Callable[[Array], Any] = np.asarray
     ) -> None:
+        # An undelayed model is a plant model with a gain of 1 and no delay. The list has the
+        # factors a1, a2, b1 and b2 of its equation, each of shape (time constants, n).
         self._coefficients = [convert(values) for values in model_coefficients(time_constants)]
         self.outputs = convert(np.zeros_like(time_constants))
         self.last_outputs = self.outputs
@@ -137,15 +141,17 @@ class UndelayedModels:
 
 
 class Whitening:
-    """The filter (1 - FAST_POLE/z) (1 - LOAD_POLE/z) / C(1/z), which whitens the plant's noise.
+    """A filter of a signal, which makes the noise of a plant nearly white.
 
-    In equation (28) of the paper, the noise of the plant is C xi / A, with polynomials A and C
-    and white noise xi.
+    The transfer function of the filter is (1 - FAST_POLE/z) (1 - LOAD_POLE/z) / C(1/z), where C
+    is a polynomial of equation (28) of the paper. In equation (28), the noise of the plant is C
+    xi / A, with polynomials A and C and white noise xi.
 
     Parameters
     ----------
     shape
-        Shape of one sample of the signal. Each element of a sample is filtered separately.
+        Shape of one sample of the signal to filter. Each element of a sample is filtered
+        separately.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -166,7 +172,7 @@ class Whitening:
 
 
 class Bank:
-    """Candidate models y(k) = g s(k - d) of n plants, with their gains and probabilities.
+    """Candidate models of n plants, with the estimated gain and probability of each model.
 
     Each model predicts the output y(k) = g s(k - d), with the gain g, the delay d in samples,
     and the output s(k) of a model with gain 1 and no delay. Each plant has one candidate model
@@ -175,7 +181,7 @@ class Bank:
     The gain g of each model is estimated by recursive least squares on whitened signals, and
     its prior mean is the gain of the step test. The probability of each model follows from its
     one-step prediction errors, which are assumed to be Gaussian. Old samples lose their weight
-    exponentially in the estimated gains and probabilities, but the prior does not.
+    exponentially in the estimated gains and probabilities, but the prior keeps its weight.
 
     At each sample, call `observe` with the measured output, and then `apply` with the flow.
 
@@ -189,7 +195,7 @@ class Bank:
     n : int
         Number of plants.
     time_constants, gain_spread : ndarray
-        The fields of `prior`, as arrays of float32.
+        The fields `time_constants` and `gain_spread` of `prior`, as arrays of float32.
     shares : ndarray
         Probabilities of the candidate time constants, shape (time constants, n).
     delay, delay_spread : ndarray
@@ -201,9 +207,8 @@ class Bank:
     pole : ndarray
         Estimated mean of the pole exp(-1 / T), for the time constant T in samples, shape (n,).
     fading : ndarray
-        Estimated mean of exp(-(d + 1) / T), for the delay d and the time constant T in samples,
-        shape (n,). This share of a deviation with the time constant T remains after d + 1
-        samples.
+        Estimated mean of the share exp(-(d + 1) / T) of a deviation with the time constant T
+        that remains after d + 1 samples, for the delay d and T in samples, shape (n,).
     variance : ndarray
         Estimated variance of the models' one-step prediction errors, in squared units of the
         steady temperature change for half the flow range, shape (n,).
@@ -211,11 +216,12 @@ class Bank:
         Newest one-step prediction error of the whitened output, as a mean over the models, in
         units of the steady temperature change for half the flow range, shape (n,).
     outputs : ndarray
-        Measured outputs y(k), y(k-1) and so on, newest first, in units of the steady
+        Measured outputs at the `LAGS` latest samples, newest first, in units of the steady
         temperature change for half the flow range, shape (LAGS, n).
     responses : ndarray
-        Delayed outputs s(k - d), s(k - d - 1) and so on of models with gain 1, as means that
-        are weighted by the probabilities of the models, shape (LAGS, n).
+        Outputs s(k - d) of the candidate models with gain 1 at the `LAGS` latest samples k,
+        newest first, as means that are weighted by the probabilities of the models, shape
+        (LAGS, n).
     """
 
     def __init__(self, prior: Prior) -> None:
@@ -291,7 +297,7 @@ class Bank:
         self._ring[row, 1] = self._whiten_response(response)
 
     def _learn(self, whitened: Array) -> None:
-        """Update the sums for the models' gains and probabilities, and the noise variance.
+        """Update the noise variance, and the sums that give the gains and probabilities.
 
         `whitened` is the newest measured output after the whitening filter, shape (n,), in
         units of the steady temperature change for half the flow range.
@@ -314,7 +320,7 @@ class Bank:
         self._products += self._regressors * whitened
 
     def _renew_estimates(self) -> None:
-        """Update the gains and probabilities of the models, and all weighted means."""
+        """Update the gains and probabilities of the models, and the means over the models."""
         # Weight of the prior gain, which is 1, in the least squares estimate of the gain.
         of_prior = self.variance / np.square(self.gain_spread)
         gains = (self._products + of_prior) / (self._information + of_prior)

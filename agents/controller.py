@@ -36,7 +36,7 @@ def _require(is_allowed: bool, name: str, value: Any, allowed: str) -> None:
 
 
 def _is_number(value: Any, kind: type[Any]) -> bool:
-    """Return whether a value is an instance of `kind`, `Real` or `Integral`, but not a bool."""
+    """Return whether `value` has the type `kind` (`Real` or `Integral`) and is not a bool."""
     return isinstance(value, kind) and not isinstance(value, bool | np.bool_)
 
 
@@ -141,8 +141,8 @@ def _validators(controller_class: type) -> dict[str, Validator]:
 class Controller(ABC):
     """A controller of one control loop, or of a batch of independent control loops.
 
-    Every controller is a dataclass whose fields are the constructor arguments. The type of a
-    field, such as `Positive`, states the allowed values.
+    Every controller is a dataclass whose fields are the constructor arguments. The type of an
+    argument, such as `Positive`, states the values that the argument may have.
 
     Parameters
     ----------
@@ -182,8 +182,8 @@ class Controller(ABC):
     def __post_init__(self) -> None:
         """Validate the constructor arguments, and call `reset`.
 
-        A subclass must call `super().__post_init__()` first. The method `reset` must not use
-        attributes that a subclass sets after this call.
+        A subclass must call `super().__post_init__()` first. This call runs `reset`, so `reset`
+        must not use attributes that a subclass sets after the call.
         """
         for name, validator in _validators(type(self)).items():
             setattr(self, name, validator(name, getattr(self, name)))
@@ -210,7 +210,8 @@ class Controller(ABC):
             Parameter values of the plants, as attributes named as in `mptc_gym.Parameters`. A
             value that differs between the plants is an array of shape (n,).
         wrapped
-            Names of the environment's wrappers that change observations or actions, or "".
+            Names of the environment's wrappers that change observations or actions; "" if there
+            are none.
         n
             Number of plants.
 

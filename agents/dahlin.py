@@ -22,12 +22,14 @@ class DahlinController(InternalModelController):
     Dahlin's control law was published in "Designing and tuning digital controllers",
     Instruments and Control Systems 41 (6), 1968, 77-83. This class implements Dahlin's control
     law as internal model control (Morari and Zafiriou, "Robust Process Control", 1989, chapter
-    3). With the sampling interval h, the control law has the factors g = 1 - exp(-h / lambda)
-    and f = 1 - exp(-h / T_f).
+    3). The control law has the factors g = 1 - exp(-h / lambda) and f = 1 - exp(-h / T_f),
+    where h is the sampling interval, lambda the time constant of the response to the set point,
+    and T_f the time constant of the low-pass filter.
 
-    - A first-order model, x(k+1) = p x(k) + b u_a(k), runs in parallel with the plant, where
-      u_a is the flow that leaves the actuator. For a delay of d samples, the prediction of the
-      plant's output y(k) is x(k-d).
+    - A first-order model, x(k+1) = p x(k) + b u_a(k), runs in parallel with the plant, where x
+      is the output of the model without delay, p the pole, b the input gain, and u_a the flow
+      that leaves the actuator. For a delay of d samples, the prediction of the plant's output
+      y(k) is x(k-d).
     - The estimated disturbance D(k), degC, is the low-pass filtered difference between the
       measured output and the model's delayed output: D(k) = D(k-1) + f (y(k) - x(k-d) -
       D(k-1)).
@@ -44,12 +46,13 @@ class DahlinController(InternalModelController):
     ----------
     closed_loop_time_constant
         lambda, the time constant of the response to a step of the set point, s. Errors up to
-        0.5 |gain| dead_zone lambda / time_constant, degC, are not corrected, because a command
-        inside the dead zone has no effect.
+        0.5 |gain| dead_zone closed_loop_time_constant / time_constant, degC, are not corrected,
+        because a command inside the dead zone has no effect.
     filter_time_constant
         T_f, the time constant of the low-pass filter of the estimated disturbance, s; 0 for no
-        filter, as in Dahlin's paper. A larger T_f makes the closed loop more robust. T_f has no
-        effect on the response to the set point if the model equals the plant.
+        filter, as in Dahlin's paper. A larger filter time constant makes the closed loop more
+        robust, and has no effect on the response to the set point if the model equals the
+        plant.
     setpoint_index, error_index
         Indices of the set point y_d(k) and the error e(k), both in degC, in an observation.
     """
@@ -73,15 +76,17 @@ class DahlinController(InternalModelController):
         self._disturbance: Values = np.float64(0.0)  # estimated disturbance D, degC
 
     def transfer(self) -> tuple[Array, Array]:
-        """Return the transfer function from -y to the command u, t/h per degC.
+        """Return the transfer function from the error e to the command u for the set point 0.
 
-        For the set point 0, the error is -y, the negative output. The transfer function is
-        valid while the command is within the flow limits and outside the dead zone.
+        The unit is t/h per degC. For the set point 0, the error is the negative output. The
+        transfer function is valid while the command is within the flow limits and outside the
+        dead zone.
 
         Returns
         -------
         numerator, denominator
-            Coefficients of z^0, z^-1, z^-2 and so on, as arrays.
+            Coefficients of z^0, z^-1, z^-2 and so on in the numerator and in the denominator of
+            the transfer function, as arrays.
         """
         share = self._approach * self._filter
         numerator = share * np.array([1.0, -self._pole])

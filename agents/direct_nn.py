@@ -89,11 +89,12 @@ class DirectNNController(Controller):
         output rises with the flow.
     input_scale
         Factor, per degC, that converts elements of an observation to the inputs X_i of the
-        network. The paper does not state the factor of the inputs.
+        network. The paper does not state by what factor temperatures are scaled to inputs of
+        the network.
     weight_scale
         Largest size of an initial weight or threshold. Initial weights and thresholds are
-        uniformly distributed in [-weight_scale, weight_scale]; the paper only calls them
-        "selected randomly".
+        uniformly distributed in [-weight_scale, weight_scale]; the paper only says "selected
+        randomly".
     error_index
         Index of the error e(k), degC, in an observation.
     seed

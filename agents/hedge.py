@@ -25,9 +25,9 @@ LOGISTIC: Final = 1.702
 class RandomSetpoint:
     """The distribution of a set point that changes at random, for n control loops.
 
-    The set point is piecewise constant. The values between two changes are independent and
+    The set point is piecewise constant. The values of the set point are independent and
     uniformly distributed. The number of samples between two changes is uniformly distributed.
-    Each field is an array of shape (n,), or one number for all loops.
+    Each field of `RandomSetpoint` is an array of shape (n,), or one number for all loops.
     """
 
     shortest: Array | float
@@ -62,13 +62,12 @@ class RandomSetpoint:
         The set point keeps its present value s with the probability `held`. After a change, the
         set point is uniformly distributed between -A and A, for the amplitude A. The future
         output is the target r plus a forecast error with the standard deviation `deviations`.
-        The expected absolute control error is least at the target r for which
-
-            held tanh(LOGISTIC (r - s) / (2 deviations)) + (1 - held) r / A = 0.
-
-        The equation assumes that the forecast error has a logistic distribution and is small
-        compared with A. The left side of the equation rises with r, so r is found by bisection
-        between 0 and s.
+        The expected absolute control error is least at the target r that solves the equation
+        held tanh(LOGISTIC (r - s) / (2 deviations)) + (1 - held) r / A = 0, where s is the
+        present set point, and A the amplitude. The equation assumes that the forecast error of
+        the output has a logistic distribution and is small compared with the amplitude A. The
+        left side of the equation rises with the target r, so r is found by bisection between 0
+        and the set point s.
 
         Parameters
         ----------

@@ -38,12 +38,12 @@ class InternalModelController(ModelBasedController):
 
     @property
     def _undelayed(self) -> Values:
-        """Newest output of the undelayed model, degC; 0 before the first sample."""
+        """Newest output of the model without its delay, degC; 0 before the first sample."""
         return self._outputs[-1]
 
     @property
     def _delayed(self) -> Values:
-        """Newest output of the delayed model, degC; 0 before the first sample."""
+        """Newest output of the model with its delay, degC; 0 before the first sample."""
         return self._outputs[0]
 
     def _command(self, wanted: Array) -> Array:

@@ -81,7 +81,7 @@ class Situation:
 
 
 class Observer:
-    """Estimator of n plants: candidate models, Kalman filters, and the age of the set point.
+    """Estimator of the delays, gains and loads of n plants, by models and Kalman filters.
 
     The computation is in NumPy, so PyTorch gradients do not pass through the estimates.
 
@@ -123,7 +123,9 @@ class Observer:
     def observe(self, setpoint: Array, output: Array) -> Situation:
         """Return the estimates of the n plants from the set points and outputs of a sample.
 
-        Call this method once per sample, before the flow of this sample is computed.
+        Call this method once per sample, before the flow of this sample is computed. In the
+        returned `Situation`, the field `shares` has the shape (time constants, n), the field
+        `inputs` the shape (n, PAST_INPUTS), and every other field the shape (n,).
 
         Parameters
         ----------
@@ -135,6 +137,8 @@ class Observer:
         """
         bank = self._bank
         bank.observe(output)
+        # `responses` are mean outputs of the models with gain 1, newest first, shape (LAGS, n),
+        # and `fading` is the share of a deviation that remains after the delay, shape (n,).
         self.filter.update(output, bank.responses[:2], bank.pole, bank.variance)
         forecast = self.filter.forecast(bank.pole, bank.fading)
         # At the first sample of an episode, there is no earlier set point to differ from.
@@ -142,9 +146,12 @@ class Observer:
         self._age = np.where(is_unchanged, self._age + 1.0, 0.0)
         self._setpoint = setpoint
         deviation = np.sqrt(bank.variance)
+        # Probability that the set point does not change before the present flow affects the
+        # output.
         held: Array = np.ones(bank.n)
         aim = setpoint
         if self._random_setpoint is not None:
+            # Samples until the output has responded to the present flow.
             ahead = bank.delay + 1.0 + REACTION
             held = self._random_setpoint.probability_held(self._age, ahead)
             aim = self._random_setpoint.targets(setpoint, held, FORECAST_SPREAD * deviation)
@@ -153,7 +160,7 @@ class Observer:
         self._k += 1
         return Situation(
             targets=(aim - forecast).astype(np.float32),
-            shares=bank.shares,
+            shares=bank.shares,  # probabilities of the candidate time constants
             pole=bank.pole,
             gain=self.filter.gain.astype(np.float32),
             gain_spread=self.filter.gain_spread.astype(np.float32),
@@ -170,10 +177,11 @@ class Observer:
         forecast: Array,
         noise: Array,
     ) -> Array:
-        """Return inputs of the correcting network, of sizes near 1, shape (n, PAST_INPUTS).
+        """Return the inputs of a correcting network that `Observer` computes, (n, PAST_INPUTS).
 
-        All arguments have the shape (n,), and temperatures are in units of the steady
-        temperature change for half the flow range.
+        A correcting network is a neural network that corrects the control law, and its inputs
+        are of order 1. All arguments have the shape (n,), and temperatures are in units of the
+        steady temperature change for half the flow range.
 
         Parameters
         ----------
@@ -240,24 +248,23 @@ class Law:
     """The control law of n control loops, which computes flows from estimates of the plants.
 
     The mean of the candidate models has the gain g, the pole p and, without the delay, the
-    output m. For a target r of the output, the control law computes the flow
+    output m. If the output shall reach a target r, the control law computes the flow f = (r +
+    share (r - m) / (1 - p)) / g, with a number `share` from 0 to 1. Then the control law moves
+    the flow f out of the dead zone, and clips f to the flow limits. The part r / g of the flow
+    keeps the output m at the target r. The other part of the flow closes the fraction `share`
+    of the gap r - m between target and output in one sample. A neural network can correct the
+    control law by three outputs:
 
-        f = (r + share (r - m) / (1 - p)) / g.
-
-    Then the control law moves the flow f out of the dead zone, and clips f to the flow limits.
-    The part r / g of the flow keeps the output m at the target r. The other part closes the
-    fraction `share` of the gap r - m in one sample. A neural network can correct the control
-    law by three outputs:
-
-    - a number that is added to r, in units of the noise's standard deviation,
-    - a relative change of r, in units of the standard deviation of the estimated gain,
-    - half the logit of `share`.
+    - a number that is added to the target r, in units of the noise's standard deviation,
+    - a relative change of the target r, in units of the standard deviation of the estimated
+      gain,
+    - half the logit of the fraction `share`.
 
     Parameters
     ----------
     bank
-        Bank of candidate models. The control law runs copies of the undelayed models, through
-        which PyTorch gradients with respect to past flows can pass.
+        Bank of candidate models. The control law runs copies of the bank's models without
+        delay, through which PyTorch gradients with respect to past flows can pass.
     dead_zone_edge
         Greatest possible half width of the dead zone, as a share of half the flow range, shape
         (n,); 0 for an actuator without a dead zone.
@@ -324,11 +331,11 @@ class Law:
         return flow
 
     def _inputs(self, situation: Situation, model_output: Any, change: Any) -> Any:
-        """Return all inputs of the correcting network, of sizes near 1, shape (n, INPUTS).
+        """Return all inputs of the network that corrects the control law, shape (n, INPUTS).
 
-        `model_output` is the output of the mean model without delay, and `change` is the
-        difference from its value at the previous sample, both of shape (n,), in units of the
-        steady temperature change for half the flow range.
+        The inputs are of order 1. `model_output` is the mean output of the candidate models
+        without delay, and `change` is the difference from its value at the previous sample,
+        both of shape (n,), in units of the steady temperature change for half the flow range.
         """
         xp = self._xp
         gap = self._convert(situation.targets) - model_output

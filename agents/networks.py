@@ -168,7 +168,7 @@ def read_settings(file: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Increments:
-    """Settings of a controller in velocity form, whose network changes a wanted flow.
+    """Settings of a controller in velocity form, whose network outputs changes of the flow.
 
     The wanted flow is 0 at the start of an episode. At each sample, the wanted flow changes by
     `max_move` times the output of the network. The command is the wanted flow with a
@@ -217,7 +217,8 @@ class PolicyNetwork(Controller):
         Settings with which the network's output changes a wanted flow; None if the network's
         output is the action.
     provenance
-        Description of the training, which `save` writes to the file; JSON-serialisable.
+        Description of the training, of values that JSON can store. The method `save` writes the
+        description to the file.
     """
 
     layers: Layers = field(repr=False, kw_only=False)
@@ -348,7 +349,7 @@ class PolicyNetwork(Controller):
         return self._compensated(self.increments.dead_zone)
 
     def _compensated(self, edge: float) -> NDArray[np.float64]:
-        """Return the commands, t/h, shape (loops,), for the wanted flows and a dead zone.
+        """Return commands for the wanted flows, 0 or outside the dead zone, t/h, (loops,).
 
         `edge` is the half width of the dead zone, t/h.
         """

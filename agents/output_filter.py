@@ -47,14 +47,15 @@ class OutputFilter:
         v(k) = a1 v(k-1) + a2 v(k-2) + (1 - a1 - a2) w(k) + xi(k) + c xi(k-1)
         w(k) = LOAD_MEMORY w(k-1) + eta(k)
 
-    The noises xi and eta are white. The coefficients a1 and a2 follow from the two poles of the
-    mean model, and c is the coefficient of z^-1 in the polynomial C of equation (28) of the
-    paper. The gain g follows a random walk. The state vector of a Kalman filter has the four
-    elements v(k), a2 v(k-1) + c xi(k), w(k) and g(k).
+    The noises xi, of the output, and eta, of the load, are white. In the equation of v, the
+    coefficients a1 and a2 follow from the two poles of the mean model, and c is the coefficient
+    of z^-1 in the polynomial C of equation (28) of the paper. The gain g of the plant follows a
+    random walk. The state vector of a Kalman filter has the four elements v(k), a2 v(k-1) + c
+    xi(k), w(k) and g(k).
 
-    The Kalman filters differ in the standard deviation of eta and in the variance of xi. The
-    weight of a Kalman filter is the likelihood of its one-step prediction errors, in which old
-    errors are forgotten exponentially.
+    The Kalman filters differ in the assumed standard deviation of load changes, eta, and in the
+    assumed variance of the noise xi. The weight of a Kalman filter is the likelihood of its
+    one-step prediction errors, in which old errors are forgotten exponentially.
 
     Parameters
     ----------
@@ -142,9 +143,9 @@ class OutputFilter:
 
         The residual v is the part of the output that the mean of the candidate models does not
         explain. The present flow affects the output after d + 1 samples. In d + 1 samples, the
-        fast part of v decays to 0, and the slow part of v moves towards the load disturbance,
-        which is assumed to be constant. The forecasts are in units of the steady temperature
-        change for half the flow range.
+        fast part of the residual v decays to 0, and the slow part of v moves towards the load
+        disturbance, which is assumed to be constant. The forecasts are in units of the steady
+        temperature change for half the flow range.
 
         Parameters
         ----------
@@ -169,9 +170,9 @@ class OutputFilter:
 
         A change of the candidate models' probabilities also changes the part of past outputs
         that the mean model explains. The state vectors are corrected as if a constant load
-        disturbance explained the change. `changes` are the changes of s(k-1), in units of the
-        steady temperature change for half the flow range, and `poles` are the slow poles exp(-1
-        / T) of the plants, both of shape (n,).
+        disturbance explained the change of past outputs. `changes` are the changes of s(k-1),
+        in units of the steady temperature change for half the flow range, and `poles` are the
+        slow poles exp(-1 / T) of the plants, both of shape (n,).
         """
         residuals = -self._states[:, :, GAIN] * changes
         self._states[:, :, RESIDUAL] += residuals

@@ -130,7 +130,8 @@ class PIController(Controller):
         Returns
         -------
         numerator, denominator
-            Coefficients of z^0 and z^-1, each of shape (2,).
+            Coefficients of z^0 and z^-1 in the numerator and in the denominator of the transfer
+            function, two arrays of shape (2,).
         """
         numerator = np.array([-(self.kp + self.ki), self.kp])
         return numerator, np.array([1.0, -1.0])

@@ -33,9 +33,9 @@ class RecurrentNetwork:
     The network corrects the control law in `agents.law`. The hidden layer and the output layer
     also receive the inputs of the network. Weights and biases are defined as in
     `torch.nn.GRUCell` and `torch.nn.Linear`, in float32. The rows of the recurrent unit's
-    arrays are ordered by reset gate, update gate and candidate state. In the shapes, `nodes` is
-    the number of nodes of the recurrent unit, and `hidden` the number of nodes of the hidden
-    layer.
+    arrays are ordered by reset gate, update gate and candidate state. In the shapes of the
+    arrays, `nodes` is the number of nodes of the recurrent unit, and `hidden` the number of
+    nodes of the hidden layer.
     """
 
     input_weights: Array
@@ -56,10 +56,11 @@ class RecurrentNetwork:
     output_biases: Array
     """Biases of the output layer, shape (OUTPUTS,)."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    """Description of the training, which `save` writes to the file; JSON-serialisable."""
+    """Description of the training, of values that JSON can store. The method `save` writes the
+    description to the file."""
 
     def __post_init__(self) -> None:
-        """Replace the arrays by float32 copies; a wrong shape is a ValueError."""
+        """Replace the weights by float32 copies; a wrong shape raises a ValueError."""
         nodes = np.shape(self.state_weights)[-1]
         hidden = np.size(self.hidden_biases)
         shapes = {
@@ -82,18 +83,19 @@ class RecurrentNetwork:
         return {name: value for name, value in vars(self).items() if name != "provenance"}
 
     def initial_state(self, n: int) -> Array:
-        """Return the state of the recurrent unit for n loops at the start, shape (n, nodes)."""
+        """Return the recurrent unit's state at the start of an episode, shape (n, nodes)."""
         return np.zeros((n, self.state_weights.shape[1]), np.float32)
 
     def step(self, inputs: Array, state: Array) -> tuple[Array, Array]:
-        """Return the outputs, shape (n, OUTPUTS), and the next state, shape (n, nodes).
+        """Return the outputs, (n, OUTPUTS), and the recurrent unit's next state, (n, nodes).
 
         Parameters
         ----------
         inputs
             Inputs of the network for n loops at one sample, shape (n, INPUTS).
         state
-            State after the previous sample, or from `initial_state`, shape (n, nodes).
+            State of the recurrent unit after the previous sample, or from `initial_state`,
+            shape (n, nodes).
         """
         from_inputs = inputs @ self.input_weights.T + self.input_biases
         from_state = state @ self.state_weights.T + self.state_biases

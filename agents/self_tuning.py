@@ -100,10 +100,10 @@ class SelfTuningController(ModelBasedController):
     dead_zone
         Greatest possible half width of the actuator's dead zone, t/h.
     delay_range
-        Shortest and longest possible delay of the plant, s, with the definition of the argument
-        `delay`. All delays in `delay_range` are equally likely. If `delay_range` is None, the
-        prior of the delay is a normal distribution around `delay`, from a third of `delay` to
-        twice `delay`.
+        Shortest and longest possible delay of the plant, s, from a change of the command to the
+        first sampled output that changes. All delays in `delay_range` are equally likely. If
+        `delay_range` is None, the prior of the delay is a normal distribution around `delay`,
+        from a third of `delay` to twice `delay`.
     setpoint_holds
         Shortest and longest time between two changes of a random set point, s. All times in
         `setpoint_holds` are equally likely. If `setpoint_holds` is None, the target of the
@@ -142,7 +142,8 @@ class SelfTuningController(ModelBasedController):
     def _prior_of_plant(self) -> Prior:
         """Return the candidate models of one plant and their prior probabilities.
 
-        A ValueError is raised if `delay_range` contains too many delays.
+        A ValueError is raised if `delay_range` contains more than `MOST_DELAYS` candidate
+        delays.
         """
         likely = self.delay / self._interval
         if self.delay_range is None:
@@ -189,9 +190,9 @@ class SelfTuningController(ModelBasedController):
     def estimates(self) -> dict[str, Array]:
         """Present estimates of the plants' parameters, a dict of arrays of shape (batch,).
 
-        The keys of the dict are `gain` (degC per t/h), `time_constant` (s) and `delay` (s, with
-        the definition of the argument `delay`). Before the first observation of an episode, the
-        dict is empty.
+        The keys of the dict are `gain` (degC per t/h), `time_constant` (s) and `delay` (s, from
+        a change of the command to the first sampled output that changes). Before the first
+        observation of an episode, the dict is empty.
         """
         if self._k == 0:
             return {}
@@ -223,7 +224,8 @@ class SelfTuningController(ModelBasedController):
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the commands u(k), t/h, shape (loops,), and update the estimates.
 
-        On a slow plant, most calls return the commands of the previous call.
+        On a plant with a time constant of 90 samples or more, many calls return the commands of
+        the previous call.
         """
         if self._k == 0:
             self._start(len(rows))
@@ -254,7 +256,8 @@ class NeuralSelfTuningController(SelfTuningController):
     Parameters
     ----------
     network
-        Trained network; by default, the network in the folder `agents/pretrained`.
+        Trained network; by default, the network in the file
+        `agents/pretrained/neural-10000.npz`.
     """
 
     network: RecurrentNetwork = field(default_factory=RecurrentNetwork.load, repr=False)

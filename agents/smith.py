@@ -21,10 +21,10 @@ class SmithPredictor(InternalModelController):
 
     A first-order model with a delay runs in parallel with the plant. The effect of past flows
     that have not yet affected the plant's output is the model's undelayed output minus the
-    model's delayed output. The input of the PI controller is the error minus the effect of
-    these past flows. If the model equals the plant, the PI controller acts as if the plant had
-    no delay (Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53,
-    1957, 217-219).
+    model's delayed output. The input of the PI controller is the error minus the effect of past
+    flows that have not yet affected the output. If the model equals the plant, the PI
+    controller acts as if the plant had no delay (Smith, "Closer control of loops with dead
+    time", Chemical Engineering Progress 53, 1957, 217-219).
 
     The gains `kp` and `ki` follow from `PIController.simc`, the SIMC rule, for the plant
     without delay. The input of the model is the flow that leaves the actuator. A command inside
@@ -70,7 +70,7 @@ class SmithPredictor(InternalModelController):
         self.n_obs = self.error_index + 1
 
     def reset(self) -> None:
-        """Set the integral and the model's output to 0, before a new episode."""
+        """Set the integral part and the model's output to 0, before a new episode."""
         super().reset()
         self._integral: Values = np.float64(0.0)  # -Ki times the sum of past errors, t/h
 
@@ -78,13 +78,14 @@ class SmithPredictor(InternalModelController):
         """Return the transfer function from the error e to the command u, t/h per degC.
 
         The transfer function is valid while the command is within the flow limits and outside
-        the dead zone. The feedback around the PI controller is the undelayed model minus the
-        delayed model.
+        the dead zone. The feedback around the PI controller is the model without delay minus
+        the model with delay.
 
         Returns
         -------
         numerator, denominator
-            Coefficients of z^0, z^-1, z^-2 and so on, as arrays.
+            Coefficients of z^0, z^-1, z^-2 and so on in the numerator and in the denominator of
+            the transfer function, as arrays.
         """
         pi_numerator, pi_denominator = PIController(self.kp, self.ki).transfer()
         model_numerator = np.array([0.0, self._input_gain])

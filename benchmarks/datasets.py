@@ -90,9 +90,10 @@ def arguments_of(preset: str) -> dict[str, Any]:
 
 
 def record(preset: str, behaviour: str, episodes: int = EPISODES) -> list[Episode]:
-    """Return recorded episodes of a preset, controlled by `BEHAVIOURS[behaviour]` in turn.
+    """Return recorded episodes of a preset's plant, with the controllers of a behaviour.
 
-    Episode i of the list that `record` returns has the seed `SEED + i`.
+    The controllers in `BEHAVIOURS[behaviour]` take turns. Episode i of the list that `record`
+    returns has the seed `SEED + i`.
     """
     controllers = BEHAVIOURS[behaviour][:episodes]
     recorded: list[Episode] = []
@@ -103,7 +104,7 @@ def record(preset: str, behaviour: str, episodes: int = EPISODES) -> list[Episod
 
 
 def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> list[Episode]:
-    """Return a recorded episode of a preset's plant under a controller for each seed."""
+    """Return recorded episodes, one for each seed, of a controller with a preset's plant."""
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.loop.rollout import make_plants
 

@@ -43,7 +43,7 @@ class Recurrent(nn.Module):
         inputs = 2 + MEMORY  # set point, error and past actions
         self.cell = nn.GRUCell(inputs, NODES)
         self.output = nn.Linear(NODES + inputs, 1)
-        self.reset()
+        self.reset()  # the first call of `act` begins an episode
 
     def begin(self, n: int) -> None:
         """Set the recurrent state and the past actions of n plants to 0."""

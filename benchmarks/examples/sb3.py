@@ -4,11 +4,11 @@
 the policy's scores. A score is 0 for a valve that never moves, and 1 for the least possible
 error.
 
-Four choices make the training fast:
+Four choices make the training of PPO fast:
 
-- **Groups.** Eight plants have the same noise and set points, and differ only in the random
-  part of their actions. From the advantage of each plant, the mean advantage of the plant's
-  group is subtracted, which makes the variance of the advantages much smaller.
+- **Groups.** The eight plants of a group have the same noise and set points, and differ only in
+  the random part of their actions. From the advantage of each plant, the mean advantage of the
+  plant's group is subtracted, which makes the variance of the advantages much smaller.
 
 - **Changes as inputs.** The policy's inputs are the error, and the changes of set point,
   temperature and flow, but not the values of set point, temperature and flow. The policy
@@ -81,7 +81,7 @@ def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
 
 
 def changes(window: Tensor, short_stretches: int) -> Tensor:
-    """Return changes of a signal between stretches of samples, shape (n, stretches - 1).
+    """Return changes of a signal from stretch to stretch of samples, (n, stretches - 1).
 
     `window` holds past samples of the signal for n plants, newest first, shape (n, length). A
     change is the mean over a stretch of samples minus the mean over the next older stretch. The
@@ -108,10 +108,10 @@ class Changes(BaseFeaturesExtractor):
 
 
 class GroupBuffer(RolloutBuffer):
-    """A rollout buffer that subtracts from each advantage the mean of a group of plants."""
+    """A rollout buffer that subtracts from each advantage the mean advantage of a group."""
 
     def compute_returns_and_advantage(self, last_values: Tensor, dones: Any) -> None:
-        """Compute returns and advantages, and subtract the mean advantage of each group."""
+        """Compute returns, and advantages minus the mean advantage of a group of plants."""
         super().compute_returns_and_advantage(last_values, dones)
         # `groups` is a view of `self.advantages`, shape (samples, plants), and changes it.
         groups = self.advantages.reshape(self.buffer_size, -1, GROUP)
@@ -178,9 +178,12 @@ def main() -> None:
     options = parser.parse_args()
 
     torch.set_num_threads(1)  # the networks are too small for more
+    # Each group of `GROUP` plants has the same noise and set points.
     plants = make_vec_env("MiddlePoint-v0", 512, group=GROUP, **PLANTS)
     layers = {"pi": [], "vf": [64, 64]}  # a linear policy; a value function of two layers
+    # `Changes` converts an observation to the inputs of the networks.
     model = make_ppo(plants, options.seed, features_extractor_class=Changes, net_arch=layers)
+    # The standard deviation of the actions falls from exp(-1.2) to exp(-4.0).
     model.learn(options.steps, Exploration(first=-1.2, last=-4.0))
     save(model, options.out / f"ppo-{options.seed}.zip")
     for env in ("MiddlePoint-v0", "MiddlePointNoisy-v0"):

@@ -74,7 +74,7 @@ class Curve(BaseCallback):
         self._scoring_seconds = 0.0  # processor time of all scores so far
 
     def _on_step(self) -> bool:
-        """Score the policy if a score is due; return False after the last score."""
+        """Score the policy if a score is due, and return whether the training goes on."""
         training_seconds = time.process_time() - self._start - self._scoring_seconds
         if training_seconds >= self._due_times[0]:
             del self._due_times[0]

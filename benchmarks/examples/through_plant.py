@@ -1,10 +1,10 @@
 """Train a network by gradients through the plant, as an example to copy and change.
 
-The command is `python -m benchmarks.examples.through_plant`. The PyTorch environment is
-differentiable, so the error of a whole run has a gradient with respect to the policy's weights.
-Training by gradients needs no value function and no exploration, and takes half a minute on one
-core. The trained policy is tested on the paper's square wave of set points, which was not used
-in the training.
+The command `python -m benchmarks.examples.through_plant` runs the example. The PyTorch
+environment is differentiable, so the error of a whole run has a gradient with respect to the
+policy's weights. Training by gradients needs no value function and no exploration, and takes
+half a minute on one core. The trained policy is tested on the paper's square wave of set
+points, which was not used in the training.
 """
 
 import sys

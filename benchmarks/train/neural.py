@@ -157,7 +157,8 @@ class Loops:
     def run(self, samples: int) -> tuple[Tensor, Tensor]:
         """Simulate the next `samples` samples of an episode, and return signals with gradients.
 
-        Backpropagation from the outputs ends where this call of `run` began.
+        Gradients of the returned signals do not reach back to samples before this call of
+        `run`.
 
         Returns
         -------
@@ -248,8 +249,8 @@ def filtered(innovations: Tensor, responses: Tensor) -> Tensor:
     Parameters
     ----------
     innovations
-        White noise of n plants, shape (samples + lags - 1, n). The first lags - 1 rows are from
-        the samples before the first row of the result.
+        White noise of n plants, shape (samples + lags - 1, n). The first lags - 1 rows of
+        `innovations` are from samples before the first sample of the result.
     responses
         Impulse response for each plant, shape (lags, n).
     """
@@ -263,14 +264,14 @@ def filtered(innovations: Tensor, responses: Tensor) -> Tensor:
 def expected_error(
     outputs: Tensor, batch: Batch, time_constant_factors: Tensor, first: int
 ) -> Tensor:
-    """Return the loss: the mean over samples and plants of the expected |e(k)|, degC.
+    """Return the loss of the training: the mean expected absolute control error, degC.
 
     The control error e(k) is the set point minus the output y(k) at the sample k. The last
     command that affects y(k) is the command of the sample k - d - 1, where d is the plant's
-    delay. The expected |e(k)| is the mean over everything that is random after the sample
-    k - d - 1: the effect of noise on y(k) has a normal distribution, and a random set point may
-    change to a level that is uniformly distributed. The loss leaves out the outputs y(k) with
-    k <= d, which no command affects.
+    delay. The expected |e(k)| is the mean over everything that is random after the last command
+    that affects y(k): the effect of noise on the output y(k) has a normal distribution, and a
+    random set point may change to a level that is uniformly distributed. The loss is a mean
+    over plants and samples, without the outputs that no command affects.
 
     Parameters
     ----------
@@ -315,20 +316,25 @@ def expected_error(
 
 
 def validate(network: RecurrentNetwork, episodes: int) -> dict[str, float]:
-    """Return the "mean_error", degC, and the valve "travel", t/h, of a network in validation.
+    """Return the mean error, degC, and the valve travel, t/h, of a network in validation.
 
     The network corrects the self-tuning controller on `episodes` validation episodes of the
-    environment `MiddlePointHard-v0`.
+    environment `MiddlePointHard-v0`. The returned dict has the keys `mean_error` and `travel`,
+    both means over the episodes. The valve travel of an episode is the sum of the absolute
+    changes of the flow.
     """
     plant = Parameters(**PRESETS["hard"])
+    # The quantities that a self-tuning controller knows of the plants in advance, whose names
+    # are in `BANK`.
     known = knowledge(BANK, plant, episodes, VALIDATION_SEED)
+    # The controller assumes the widest dead zone that a plant of `hard` may have.
     controller = with_bank(NeuralSelfTuningController, network=network, **known)
     result = evaluate(controller, IDS["hard"], episodes=episodes, seed=VALIDATION_SEED)
     return {"mean_error": result.mean_error, "travel": result.travel}
 
 
 def train(training: Training, seed: int) -> RecurrentNetwork:
-    """Train a network, and return the network with validation results in `provenance`.
+    """Train a network, and return it with validation results in the attribute `provenance`.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ class Batch:
 
     @property
     def signals(self) -> dict[str, Tensor]:
-        """Parameter values, set points and noise, for `reset(options={"signals": ...})`.
+        """Parameter values, set points and noise, for the option "signals" of `reset`.
 
         The noise, degC, is C xi, with the white noise xi and the polynomial C of equation (28)
         of the paper.
@@ -119,8 +119,8 @@ class Sampler:
     of a step test with errors. Set points of plants unlike `hard` change less often than in
     `hard`, and mostly alternate between a positive and a negative value.
 
-    The code must draw random numbers in an unchanged order, so that a training gives the
-    published network with the same seed.
+    The code of `Sampler` must keep the order of its random draws, so that a training with the
+    seed of a published network gives this network.
 
     Parameters
     ----------
@@ -227,9 +227,10 @@ class Sampler:
     def _amplitudes(self, gain_factors: Tensor, is_hard: Tensor) -> Tensor:
         """Return a random amplitude of the set points of each plant, degC, shape (n,).
 
-        Plants like those of the preset `hard` (`is_hard`) have the amplitude of the paper. For
-        all other plants, the amplitude is within the temperature range of the plant, which is
-        in proportion to `gain_factors`, the gains as multiples of the paper's gain.
+        Plants like those of the preset `hard` (`is_hard`) have set points of the paper's
+        amplitude. For all other plants, the amplitude is within the temperature range of the
+        plant, which is in proportion to `gain_factors`, the gains as multiples of the paper's
+        gain.
         """
         reachable = 0.95 * GAIN * HALF_RANGE * gain_factors
         amplitudes = torch.where(self._true_for(0.5), 5.0, self._uniform(1.0, 6.0))
@@ -238,8 +239,8 @@ class Sampler:
     def _setpoints(self, amplitudes: Tensor, is_hard: Tensor) -> tuple[Tensor, Tensor]:
         """Return random set points, degC, and the number of samples since the last change.
 
-        Both results have the shape (SAMPLES + 1, n). `amplitudes` are the largest set points of
-        the plants, degC, shape (n,).
+        Both returned tensors have the shape (SAMPLES + 1, n). `amplitudes` are the largest set
+        points of the plants, degC, shape (n,).
         """
         shortest_hard, longest_hard = HOLD_TIMES
         shortest_other = self._uniform(longest_hard + 10.0, 700.0)
@@ -272,9 +273,10 @@ class Sampler:
 
         The true values `factors`, and the found values, are multiples of the paper's gain or
         time constant. For a plant like those of the preset `hard` (`is_hard`), a step test
-        finds the middle of the range in `hard`. For a plant unlike `hard`, a step test finds
-        the true value (`is_exact`) or a value with a random error. The logarithm of the found
-        value divided by the true value has the standard deviation `spread`.
+        finds the middle of the range that `hard` has for the gain or time constant. For a plant
+        unlike `hard`, a step test finds the true value if `is_exact` is true, and otherwise a
+        value with a random error. The logarithm of the found value divided by the true value
+        has the standard deviation `spread`.
         """
         middle = sum(HARD["gain_factor"]) / 2.0  # for the time constant, the range is equal
         normal = torch.randn(self._n, generator=self._generator).clamp(-2.0, 2.0)
@@ -294,7 +296,7 @@ class Sampler:
         """
         poles = 1.0 - (1.0 - POLE) / time_constant_factors
         time_constants = -1.0 / torch.log(poles)  # samples
-        # The place of the plant's delay among the delays of its bank, 0 for the shortest.
+        # Index of each plant's true delay among the delays of its candidate models, from 0.
         places = self._uniform(0.0, DELAYS).floor()
         shortest = (delays - places).clamp(min=1.0)
         shortest = torch.where(is_hard, HARD["delay"][0], shortest)
@@ -313,6 +315,7 @@ class Sampler:
             time_constants=(torch.from_numpy(TIME_CONSTANTS)[:, None] * time_constants).numpy(),
             shortest_delays=shortest.numpy(),
             log_probabilities=logarithms.numpy(),
+            # Prior standard deviation of the gain, divided by the gain of the step test.
             gain_spread=torch.where(is_exact, EXACT_GAIN_SPREAD, GAIN_SPREAD).numpy(),
         )
 
@@ -323,7 +326,8 @@ class Sampler:
 
         After an exact step test (`is_exact`), controllers assume the true half width. For
         plants like those of the preset `hard` (`is_hard`), controllers assume the greatest half
-        width in `hard`. For all other plants, the half width is up to 3 t/h too large.
+        width in `hard`. For all other plants, controllers assume a half width that is up to 3
+        t/h too large.
         """
         margins = self._uniform(0.0, 3.0) * ~is_exact
         widest = (dead_zones + margins).clamp(max=8.0)

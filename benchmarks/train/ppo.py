@@ -1,8 +1,8 @@
 """Train policies by PPO of Stable-Baselines3 on many plants, and export the policies to NumPy.
 
 The dict `RECIPES` has a recipe `ppo` for the paper's plant, and a recipe `ppo-hard` for plants
-that differ between episodes. The module `benchmarks/examples/sb3.py` has the training itself,
-and explains why the training succeeds.
+that differ between episodes. The module `benchmarks/examples/sb3.py` has the code of the
+training, and explains why the training succeeds.
 """
 
 import time
@@ -81,7 +81,7 @@ class Recipe:
 
     @property
     def temperature_scale(self) -> float:
-        """The amplitude of the set points, as a multiple of the paper's amplitude."""
+        """The factor by which `for_plant` scaled temperatures; 1 for other recipes."""
         # `for_plant` scales the reward's error in proportion to the amplitude.
         error_scale: float = self.plants[0].arguments.get("error_scale", ERROR_SCALE)
         return error_scale / ERROR_SCALE
@@ -125,9 +125,9 @@ RECIPES = {
 def for_plant(plant: Mapping[str, Any]) -> Recipe:
     """Return the recipe `ppo`, adapted to a plant that differs from the paper's plant.
 
-    Set points, errors and temperatures are scaled in proportion to the argument
-    `setpoint_amplitude`. If the plant has no noise, most training plants get noise in
-    proportion to the largest temperature change that the flow can cause.
+    In the adapted recipe, set points, errors and temperatures are scaled in proportion to the
+    plant's argument `setpoint_amplitude`. If the plant has no noise, most training plants get
+    noise in proportion to the largest temperature change that the flow can cause.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
 
 
 def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> PolicyNetwork:
-    """Train a policy, and return the policy with validation results in `provenance`.
+    """Train a policy, and return it with validation results in the attribute `provenance`.
 
     Parameters
     ----------
@@ -222,8 +222,9 @@ class Plants(GymnasiumVecEnv):
     """The training plants of `recipe`, as a vector environment of Stable-Baselines3.
 
     Each group of `GROUP` successive plants has one seed, so all plants of the group have the
-    same parameter values, noise and set points. The observations are the inputs of the policy:
-    the matrix from `features`, multiplied by the observations of `MiddlePoint-v0`.
+    same parameter values, noise and set points. An observation of `Plants` has the inputs of
+    the policy: an observation of `MiddlePoint-v0`, multiplied by the matrix that `features`
+    returns.
 
     Parameters
     ----------
@@ -279,9 +280,9 @@ class Plants(GymnasiumVecEnv):
 def features(recipe: Recipe) -> Array:
     """Return the matrix that converts an observation to the inputs of the policy.
 
-    The matrix has the shape (number of inputs, length of an observation). The inputs of the
-    policy are the control error; the changes of set point, temperature and flow; and, with
-    `recipe.levels`, the set point and the flow.
+    The returned matrix has the shape (number of inputs, length of an observation). The inputs
+    of the policy are the control error; the changes of set point, temperature and flow; and, if
+    `recipe.levels` is true, the set point and the flow.
     """
     # The inputs are linear in the observation. So row i of the transposed matrix has the inputs
     # for an observation that is 1 at the element i and 0 elsewhere.
@@ -299,8 +300,9 @@ def features(recipe: Recipe) -> Array:
 def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
     """Return a trained policy, without exploration, as a network in NumPy.
 
-    The matrix `features(recipe)` becomes part of the first layer, so the input of the network
-    is an observation of `MiddlePoint-v0`. `model` was trained with `recipe`.
+    The matrix that converts an observation to inputs of the policy becomes part of the
+    network's first layer, so the input of the network is an observation of `MiddlePoint-v0`.
+    `model` was trained with `recipe`.
     """
     layers = []
     for layer in (*model.policy.mlp_extractor.policy_net, model.policy.action_net):
