@@ -92,9 +92,9 @@ class Options:
 def work(options: Options) -> str:
     """Print a table of least possible mean errors, and return an explanation of the columns.
 
-    If an error or an interruption ends the computation, the table has only the finished cases.
-    If `options.package` is true, the file `mptc_gym/bounds.json` is written, no table is
-    printed, and a text with the path of the file is returned.
+    If an error or an interruption ends the computation, the printed table has only the cases
+    that are finished. With the option `--package`, write the file `mptc_gym/bounds.json`
+    instead, and return a text with the path of the file.
     """
     import pandas as pd
 
@@ -131,9 +131,9 @@ def description() -> str:
 def row(case: Scenario, options: Options) -> dict[str, str]:
     """Return a case's row of the printed table: mean errors, degC, as texts by column heading.
 
-    The text is "" in the column "without preview" if set points are not random, in the column
-    "reference" if no reference exists, and in the column "hidden load (estimate)" if the case
-    has no load.
+    The returned text is "" for the column "without preview" if set points are not random, for
+    the column "reference" if the set point changes before the plant has settled, and for the
+    column "hidden load (estimate)" if the case has no load.
     """
     from benchmarks.bounds.least import least_possible, with_hidden_load
     from benchmarks.controllers.roster import ROSTER
@@ -166,7 +166,7 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
 def write_package(fan_out: FanOut) -> str:
     """Write the file `mptc_gym/bounds.json`, and return a text with the path of the file.
 
-    `fan_out` distributes the cases to worker processes.
+    `fan_out` distributes the cases of `PACKAGED` to worker processes.
     """
     tasks = {name: partial(packaged_case, arguments) for name, arguments in PACKAGED.items()}
     cases = dict(fan_out.stream(tasks, "bounds"))
@@ -189,11 +189,11 @@ def write_package(fan_out: FanOut) -> str:
 def packaged_case(arguments: dict[str, Any]) -> dict[str, Any]:
     """Return the least possible errors of a case for the file `mptc_gym/bounds.json`.
 
-    `arguments` are the arguments of the environment that define the case. The list "least" has
-    the least possible mean error of each evaluation episode, degC, or a single number if all
-    episodes have the same least possible error. If the least possible error differs between
-    episodes, the list "validation_least" has the least possible mean error, degC, of each
-    episode with which trained policies are selected.
+    `arguments` are the arguments of the environment that define the case. In the returned dict,
+    the list "least" has the least possible mean error of each evaluation episode, degC, or a
+    single number if all episodes have the same least possible error. If the least possible
+    error differs between episodes, the returned dict also has the list "validation_least": the
+    least possible mean error, degC, of each episode with which trained policies are selected.
     """
     from benchmarks.bounds.least import least_possible
 

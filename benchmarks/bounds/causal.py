@@ -8,29 +8,23 @@ point changed to the level.
 
 A controller without preview learns of a change of the set point when the change happens, so the
 controller's flow u_a(j) at sample j depends only on the set points up to j. If the price pi(j)
-of a flow, in degC per t/h, satisfies E[pi(j) | set points up to j] = 0, then the mean cost of
-the flows of a controller without preview is 0:
-
-    E[sum_j pi(j) u_a(j)] = 0.
-
-So adding the costs pi(k) u_a(k) to the errors |e(k)| does not change the expected sum of the
-errors of a controller without preview. For given set points, the sum of |e(k)| + pi(k) u_a(k)
-over an episode has a minimum over all flows, even flows that use future set points. The mean of
-this minimum over random set points is a lower bound of the expected sum of |e(k)| for every
+of a flow, in degC per t/h, satisfies E[pi(j) | set points up to j] = 0, then the mean of sum_j
+pi(j) u_a(j), the total cost of the flows of a controller without preview, is 0. So adding the
+costs pi(k) u_a(k) to the errors |e(k)| does not change the expected sum of the errors of a
+controller without preview. For given set points, the sum of |e(k)| + pi(k) u_a(k) over an
+episode has a minimum over all flows, even flows that use future set points. The mean of this
+minimum over random set points is a lower bound of the expected sum of |e(k)| for every
 controller without preview (Brown, Smith and Sun, "Information relaxations and duality in
 stochastic dynamic programs", Operations Research 58, 2010, 785-801). Every price whose mean is
 0, given the set points up to the sample of the flow, gives a valid lower bound, but a poor
 choice of the price gives a lower bound that is far below the error of real controllers. This
-module chooses the price
-
-    pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]).
-
-The number G[k, j] is the effect of a flow of 1 t/h at sample j on the output y(k), degC. The
-*slope* g(k), a number from -1 to 1, estimates roughly how fast the mean error E|e(k)| rises
-with the expected error E[e(k)]. From a change of the set point until the output can have
-reached the new level, the slope g is the sign of the change. After the output can have reached
-the new level, the slope g is chosen so that an additional flow would not change the sum of the
-mean errors.
+module chooses the price pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]), where
+G[k, j] is the effect of a flow of 1 t/h at sample j on the output y(k), degC, and the *slope*
+g(k), a number from -1 to 1, estimates roughly how fast the mean error E|e(k)| rises with the
+expected error E[e(k)]. From a change of the set point until the output can have reached the new
+level, the slope g(k) of the mean error is the sign of the change. After the output can have
+reached the new level of the set point, the slope g(k) of the mean error is such that an
+additional flow would not change the sum of the mean errors from its first effect on.
 """
 
 import numpy as np
@@ -59,8 +53,10 @@ HORIZON = 200
 class SetPointLaw:
     """The penalty for flows that use future set points, for random set points on one plant.
 
-    The description of the module defines the penalty and the slope g. The slope g is computed
-    for the plant's dynamics at the start of the episode.
+    The docstring of the module derives the penalty from a slope g(k), which estimates how fast
+    the mean error E|e(k)| rises with the expected error E[e(k)]. The slope g(k) of the mean
+    error is computed for the plant's dynamics at the start of the episode, even if the plant
+    drifts.
 
     Parameters
     ----------
@@ -68,7 +64,7 @@ class SetPointLaw:
         Model of one plant at all samples of an episode.
     bounds
         Lower bounds of the mean errors for the plant `model`. The standard deviation of the
-        noise is computed from the lower bounds.
+        noise is computed from the lower bound at the last sample for an expected error of 0.
     """
 
     def __init__(self, model: LinearModel, bounds: ErrorBounds) -> None:
@@ -111,10 +107,10 @@ class SetPointLaw:
         self._impulse = at_start.impulse_response(samples + zeros)[zeros:]
 
     def penalty(self, setpoint: Array) -> Array:
-        """Return the prices of the flows in one episode, degC per t/h, shape (samples,).
+        """Return the price of the flow at each sample, degC per t/h, shape (samples,).
 
-        The price of the flow at sample j is pi(j), which the description of the module defines.
-        `setpoint` has the set points of the episode, degC, shape (samples,).
+        The docstring of the module defines the price pi(j) of the flow at sample j. `setpoint`
+        has the set points of the episode, degC, shape (samples,).
         """
         samples = len(setpoint)
         slope = np.zeros(samples)  # g(k)
@@ -144,12 +140,13 @@ class SetPointLaw:
         slope_if_held: Array,
         change_sums: Array,
     ) -> Array:
-        """Return the mean slopes dE|e|/dE[e] at `ages` of a level of the set point.
+        """Return the mean slopes dE|e|/dE[e] at `ages`, samples after a set-point change.
 
-        The means are conditional on no change of the set point up to the age `known_age`, in
-        samples, which is lower than all elements of `ages`. `slope_if_held` has the slope at
-        each age of a level that never changes. `change_sums` has the cumulative sums that
-        `_sums_after_next_change` returns for the level of the set point.
+        The means are conditional on no second change of the set point up to `known_age` samples
+        after the change, where `known_age` is lower than all elements of `ages`. Element i of
+        `slope_if_held` is the slope dE|e|/dE[e] i samples after the change if the set point
+        never changes again. `change_sums` has the cumulative sums of mean slopes that
+        `_sums_after_next_change` returns for the set point after the change.
         """
         # The set point changes to the next level at an age of the present level from `first` to
         # `longest`; all these ages are equally probable.
@@ -164,8 +161,8 @@ class SetPointLaw:
         """Return the slopes dE|e|/dE[e] after a change of the set point, shape (samples,).
 
         The set point changes from `previous_level` to `level`, degC. The slope is the sign of
-        the change times the probability that the error is larger than the noise, and 0 after
-        the output has arrived at the new level.
+        the change times the probability that the error is larger than the noise, and 0 once the
+        output can have reached the new level.
         """
         change = level - previous_level
         way = max(self._reachable - np.sign(change) * previous_level, 0.0)
@@ -175,7 +172,7 @@ class SetPointLaw:
         return slope
 
     def _mean_slope_after_change(self, level: float) -> Array:
-        """Return the mean of `_slope_after_change` over all new levels, shape (samples,).
+        """Return the mean slopes dE|e|/dE[e] after a random set-point change, shape (samples,).
 
         The set point changes from `level`, degC, to a new level that is uniformly distributed
         from -A to A, where A is the amplitude of the set points, degC.
@@ -195,9 +192,10 @@ class SetPointLaw:
     def _sums_after_next_change(self, level: float) -> Array:
         """Return cumulative sums of mean slopes after the set point leaves `level`, degC.
 
-        Element `longest + 1 + i` is the sum of the mean slopes dE|e|/dE[e] from the change to i
-        samples after the change, where `longest` is the largest number of samples for which a
-        level lasts. The first `longest + 1` elements, for samples before the change, are 0.
+        Element `longest + 1 + i` of the result is the sum of the mean slopes dE|e|/dE[e] from
+        the change to i samples after the change, where `longest` is the largest number of
+        samples for which a level lasts. The first `longest + 1` elements of the result, for
+        samples before the change, are 0.
         """
         # After a second change, the mean slope is 0, since the distribution of levels is
         # symmetric around 0.
@@ -205,14 +203,17 @@ class SetPointLaw:
         return np.append(np.zeros(self._longest + 1), np.cumsum(mean_slope))
 
     def _slope_after_arrival(self, change_sums: Array) -> Array:
-        """Return the slopes dE|e|/dE[e] after the output has arrived at a level, by age.
+        """Return the slopes dE|e|/dE[e] once the output can have reached a new set point.
 
-        The slope at an age solves an equation: an additional flow whose first effect is at this
-        age does not change the sum of the mean errors, so the sum of the impulse response times
-        the mean slopes is 0. The equations are solved from the highest age to the lowest age,
-        since the slope at an age depends on the slopes at all higher ages. `change_sums` has
-        the cumulative sums that `_sums_after_next_change` returns for the level of the set
-        point.
+        Element i of the result is the slope i samples after the change of the set point, or 0
+        while the output cannot have reached the new set point. An additional flow whose first
+        effect is i samples after the change must not change the sum of the mean errors E|e| at
+        this and all later samples. So the slope i samples after the change is the number from
+        -1 to 1 for which, summed over this and all later samples, the plant's impulse response
+        times the mean slopes is as close to 0 as possible. The slopes are computed from the
+        latest to the earliest sample, since each slope depends on all later slopes.
+        `change_sums` has the cumulative sums of mean slopes that `_sums_after_next_change`
+        returns for the new set point.
         """
         samples = len(self._probability_held)
         slope = np.zeros(samples)

@@ -30,7 +30,7 @@ def normal(variance: Array, atoms: int) -> Distribution:
     variance
         Variance of the distribution at each sample, degC^2, shape (samples,).
     atoms
-        Number of values of each distribution.
+        Number of values that approximate the distribution at each sample.
     """
     # The values are the means of equally probable slices of the standard normal distribution,
     # computed without scipy.stats, which takes long to import.
@@ -50,7 +50,7 @@ def uniform(half_width: Array, atoms: int) -> Distribution:
         Half the width of the distribution at each sample, degC, shape (samples,). The sign of a
         half width has no effect on the distribution.
     atoms
-        Number of values of each distribution.
+        Number of values that approximate the distribution at each sample.
     """
     # Means of equally long parts of the interval from -1 to 1.
     means = (np.arange(atoms) + 0.5) / atoms * 2.0 - 1.0
@@ -74,9 +74,10 @@ def sum_of(first: Distribution, second: Distribution, atoms: int) -> Distributio
 def mixture(parts: Sequence[Distribution], probabilities: Sequence[Array]) -> Distribution:
     """Return the distribution of a random number that follows one of `parts`, chosen at random.
 
-    `probabilities` has the probability of each part at each sample, in arrays of shape
-    (samples,). The values of the returned distribution are the values of all parts, in the
-    order of the parts.
+    For each distribution in `parts`, `probabilities` has an array of shape (samples,): the
+    probability, at each sample, that the random number follows this distribution. The values of
+    the returned distribution are the values of all distributions in `parts`, in the order of
+    `parts`.
     """
     weights = [
         probability[:, np.newaxis] * part.weights

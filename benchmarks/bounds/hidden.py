@@ -1,18 +1,19 @@
 """Estimate the least possible error of controllers that cannot measure the load.
 
-A lower bound of `least.py` holds for controllers that know the load up to the sample k - d - 1,
-where d is the plant's delay in samples. A real controller has only the transmitter's readings,
-in which noise hides the load. No lower bound is known for controllers that have only readings,
-so this module estimates the least possible error of these controllers. Reports show the
-estimate in the column "hidden load".
+A lower bound that `least.py` computes for the error at sample k holds for controllers that know
+the load up to the sample k - d - 1, where d is the plant's delay in samples. A real controller
+has only the transmitter's readings, in which noise hides the load. No lower bound is known for
+controllers that have only readings, so this module estimates the least possible error of these
+controllers. Reports show the estimate in the column "hidden load".
 
-The estimate for a hidden load is a lower bound for a known load plus the increase of the least
-possible error from a known load to a hidden load. The increase of the least possible error is
-computed for a normally distributed load that has the variances and correlations of the real
-load. With a normal load, the unknown part of the output y(k) is normal, and a Kalman filter
-gives the variance of the unknown part. A load that jumps causes smaller errors than a normal
-load with the same variance, but most of this difference cancels when the least possible error
-with a known load is subtracted from the least possible error with a hidden load.
+The estimate for a hidden load is the least possible error with a known load, plus the increase
+of the least possible error from a known load to a hidden load. The increase of the least
+possible error is computed for a normally distributed load that has the variances and
+correlations of the real load. With a normal load, the part of the output y(k) that is unknown
+when the last flow that can affect y(k) is chosen is normally distributed, and a Kalman filter
+gives the variance of this part. A load that jumps causes smaller errors than a normal load with
+the same variance, but most of this difference cancels when the least possible error with a
+known load is subtracted from the least possible error with a hidden load.
 """
 
 import numpy as np
@@ -32,10 +33,11 @@ Array = NDArray[np.float64]
 
 
 def bounds_with_known_load(model: LinearModel) -> ErrorBounds:
-    """Return lower bounds of the mean errors at k if the load is known up to k - d - 1.
+    """Return lower bounds of the mean errors of a controller that knows the past load.
 
-    The number d is the plant's delay in samples. The load is taken to be normally distributed.
-    `model` is the plant at the samples k = 0, 1, ... of an episode.
+    The lower bound at sample k holds if the controller knows the load up to sample k - d - 1,
+    where d is the plant's delay in samples, and if the load is normally distributed. `model` is
+    the plant at the samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)
     filtered = np.zeros_like(F)  # The variance of a known load is 0.
@@ -46,9 +48,9 @@ def bounds_with_known_load(model: LinearModel) -> ErrorBounds:
 def bounds_with_hidden_load(model: LinearModel) -> ErrorBounds:
     """Return lower bounds of the mean errors if only the transmitter's readings are known.
 
-    For the error at sample k, the readings up to k - d - 1 are known, where d is the plant's
-    delay in samples. The load is taken to be normally distributed. `model` is the plant at the
-    samples k = 0, 1, ... of an episode.
+    The lower bound at sample k holds if the controller knows the readings up to sample
+    k - d - 1, where d is the plant's delay in samples, and if the load is normally distributed.
+    `model` is the plant at the samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)
     filtered = filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
@@ -56,11 +58,12 @@ def bounds_with_hidden_load(model: LinearModel) -> ErrorBounds:
 
 
 def _with_load(model: LinearModel) -> tuple[Array, Array]:
-    """Return F(k) and Q(k) of the state equation of a plant with a normally distributed load.
+    """Return the matrices F(k) and Q(k) of the state equation of a plant with a normal load.
 
     The state equation is x(k) = F(k) x(k-1) + v(k), where x(k) is the state of
     `LinearModel.state_space_with_load`, and v(k) is white noise with the covariance matrix
-    Q(k). F and Q have the shape (samples, size, size), where size is the length of x(k).
+    Q(k). The two returned arrays have the shape (samples, size, size), where size is the length
+    of the state x(k).
     """
     numbers = model.numbers
     k = np.arange(len(model.load_factor))

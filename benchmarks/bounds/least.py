@@ -110,9 +110,10 @@ def least_possible(
     samples
         Length of an episode, samples.
     kind
-        Kind of the least possible error, one of `KINDS`. If `kind` is None, as in reports and
-        in `mptc_gym.evaluate`, the kind is "causal" for random set points, "preview" for
-        constant set points, and otherwise "reference", or "preview" if no reference exists.
+        Kind of the least possible error: "preview", "causal" or "reference". If `kind` is None,
+        as in reports and in `mptc_gym.evaluate`, the kind is "causal" for random set points,
+        "preview" for constant set points, and otherwise "reference", or "preview" if no
+        reference exists.
     episodes
         Number of episodes over which the least possible error is averaged, if plants or set
         points are random.
@@ -161,8 +162,8 @@ def with_hidden_load(
     """Return an estimate of the least possible mean |e(k)| if the load is not measured, degC.
 
     The estimate for a hidden load, which `hidden.py` derives, is not a lower bound. If the
-    plant has no load, the least possible error is returned. `least_possible` describes the
-    parameters and exceptions.
+    plant has no load, the least possible error is returned. The parameters and exceptions are
+    those of `least_possible`.
     """
     least = least_possible(samples=samples, episodes=episodes, seed=seed, **arguments)
     parameters = Parameters(**arguments)
@@ -180,7 +181,7 @@ def with_hidden_load(
 
 
 class _Episodes(NamedTuple):
-    """Parameter values of the plants, set points and idle-valve errors of several episodes."""
+    """Plants and set points of several episodes, and the mean errors of an idle valve."""
 
     numbers: Sequence[PlantNumbers[float]]  # parameter values of each plant
     setpoints: Array  # y_d(k) for k = 0 to N, degC, shape (episodes, N + 1)
@@ -189,7 +190,7 @@ class _Episodes(NamedTuple):
 
 
 def _episodes_of(parameters: Parameters, samples: int, episodes: int, seed: int) -> _Episodes:
-    """Return the plants, set points and idle-valve errors of the environment's episodes.
+    """Return plants and set points of several episodes, and mean errors of an idle valve.
 
     An episode has the samples k = 0 to `samples`, and episode i has the seed `seed + i`.
     """
@@ -208,10 +209,11 @@ def _episodes_of(parameters: Parameters, samples: int, episodes: int, seed: int)
 def _bound(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
 ) -> LeastPossible:
-    """Return the least possible mean error, degC, of one of `KINDS`.
+    """Return the least possible mean error |e| of the kind `kind`, degC.
 
-    `least_possible` describes the parameters. A NoBoundError is raised if `kind` is "reference"
-    and no reference exists.
+    The parameters are those of `least_possible`, but `kind` must be "preview", "causal" or
+    "reference". A NoBoundError is raised if `kind` is "reference" and the set point changes
+    before the plant has settled.
     """
     if not is_random(parameters):
         episodes = 1
@@ -237,14 +239,14 @@ def _error_sum(
 ) -> float:
     """Return the least possible sum of |e(k)| over k = 1 to N in one episode, degC.
 
-    For the kind "causal", the sum contains the penalty for flows that use future set points,
-    and only the mean of the sum over many episodes is a lower bound. For the kind "reference",
-    the sum contains a small price of valve travel: solvers agree on the sum with the price, but
-    not on the sum without the price.
+    If `kind` is "causal", the returned sum contains the penalty for flows that use future set
+    points, and only the mean of the returned sums of many episodes is a lower bound. If `kind`
+    is "reference", the returned sum contains a small price of valve travel, since solvers agree
+    on the sum of errors and price, but not on the sum of errors alone.
 
     `numbers` has the parameter values of the episode's plant, and `setpoint` has the set points
-    y_d(k) for k = 0 to N, degC. `bounds_of` returns the lower bounds of the mean errors for a
-    plant.
+    y_d(k) for k = 0 to N, degC. The function `bounds_of` returns lower bounds of the mean error
+    at each sample for a model of the plant.
     """
     length = len(setpoint)
     if kind == "reference":  # A reference plans beyond the end of the episode.

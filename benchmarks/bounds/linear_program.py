@@ -39,8 +39,8 @@ TRAVEL_PRICE = 1e-4
 class ErrorBounds:
     """Lower bounds of the mean absolute error E|e| at each sample, as functions of |E[e]|.
 
-    The lower bound at a sample is the maximum of several lines, intercept + slope * |E[e]|,
-    which the module `unknown.py` derives.
+    The lower bound of E|e| at a sample is the highest of several straight lines, intercept +
+    slope * |E[e]|, which the module `unknown.py` derives.
     """
 
     # The slopes of the lines, ascending from 0 to 1, shape (slopes,). If neither noise nor load
@@ -60,7 +60,7 @@ class ErrorBounds:
 
     @property
     def lengths(self) -> Array:
-        """Length of the range of |E[e]| in which each line of a bound is the highest, degC.
+        """Length of the range of |E[e]| in which each line is the highest line, degC.
 
         The lengths have the shape (samples, slopes). The last length at each sample is
         infinite, since the steepest line is the highest line for all large values of |E[e]|.
@@ -86,8 +86,8 @@ def equations(model: LinearModel, samples: int) -> tuple[Any, Any]:
 def _lagged(coefficients: Array, lag: int) -> Any:
     """Return a sparse square matrix with coefficients[k, i] in row k, column k - lag - i.
 
-    `coefficients` has the shape (samples, order), and the matrix has the shape (samples,
-    samples).
+    `coefficients` has the shape (samples, order), and the returned matrix has the shape
+    (samples, samples).
     """
     samples, order = coefficients.shape
     # SciPy places the elements of diagonals by column. The transpose places them by row.
@@ -105,7 +105,7 @@ def response(A: Any, B: Any) -> Array:
 
 
 class Plan(NamedTuple):
-    """The planned flows of an episode, and lower bounds of the mean errors with the flows."""
+    """The planned flows of an episode, and lower bounds of the mean errors with these flows."""
 
     errors: Array  # lower bounds of E|e(k)|, degC, shape (samples,)
     flow: Array  # mean of the applied flow u_a(k), t/h, shape (samples,)
@@ -122,9 +122,9 @@ def plan(
 ) -> Plan:
     """Return the flows for which the sum of the lower bounds of the mean errors is least.
 
-    The least sum is a lower bound of the sum of errors for every controller, even for a
-    controller that knows the future. In the proof, y and u are the means of output and applied
-    flow over all noise, loads and random decisions of a controller:
+    The least sum of the lower bounds is a lower bound of the sum of the mean errors for every
+    controller, even for a controller that knows the future. In the proof, y and u are the means
+    of output and applied flow over all noise, loads and random decisions of a controller:
 
     - Equation (28) of the paper is linear, so the means y and u satisfy equation (28) without
       noise.
@@ -133,14 +133,15 @@ def plan(
     - The expected error is the set point minus the mean output y, and `bounds` gives a lower
       bound of the mean absolute error for each expected error.
 
-    So the mean error of every controller is at least the minimum of the bounds over all mean
-    flows u within the limits. A linear program finds the minimum, as each bound is a maximum of
-    lines.
+    So the sum of the mean errors of every controller is at least the least sum of the lower
+    bounds over all mean flows u within the limits. A linear program finds the least sum of the
+    lower bounds, since each lower bound is the maximum of several straight lines.
 
-    The lower bound is loose where the required flow lies inside the dead zone: the mean of the
-    flows 0 and 5 t/h is 2.5 t/h, but a valve with a dead zone of 5 t/h cannot apply a flow of
-    2.5 t/h. The lower bound is also loose where the required flow lies now inside and now
-    outside the limits of the actuator.
+    The lower bound of the errors is far below the errors of real controllers where the required
+    flow lies inside the dead zone: the mean of the flows 0 and 5 t/h is 2.5 t/h, but a valve
+    with a dead zone of 5 t/h cannot apply a flow of 2.5 t/h. The lower bound of the errors is
+    also far below the errors of real controllers where the required flow lies now inside and
+    now outside the limits of the actuator.
 
     Parameters
     ----------
@@ -195,16 +196,18 @@ def _variables(count: int, cost: Any, low: Any, high: Any) -> _Variables:
 
 
 class _Program(NamedTuple):
-    """The linear program of `plan` for the n flows that follow the past flows.
+    """The linear program that chooses the n flows after the past flows, which are fixed.
 
-    The effects y of the n flows u on the outputs satisfy A y = B u. The program represents the
-    expected error at each sample as a sum of positive pieces minus a sum of negative pieces,
-    with one piece of each sign for every slope of the error bound. For k below n, `targets[k]`
-    is the set point minus the effect of past flows, degC, and equals the effect of the n flows
-    on output k plus the expected error at k. With the option `quiet` of `plan`, the program has
-    n more equations: `targets[n + k]` equals flow k minus flow k - 1, minus the upward move of
-    the valve, plus the downward move of the valve. `targets[n]` is the last past flow, t/h, and
-    the later targets are 0.
+    The effects y of the n flows u on the outputs satisfy A y = B u, where A and B are the
+    plant's matrices in equation (28) of the paper. The linear program writes the expected error
+    at each sample as a sum of positive pieces minus a sum of negative pieces, with one piece of
+    each sign for every slope of the lower bound of the mean error. The effect of the n flows on
+    output k plus the expected error of output k equals `targets[k]`, the set point minus the
+    effect of the past flows, degC, where k counts from 0 to n - 1. If the argument `quiet` of
+    `plan` is true, the linear program has n more equations: flow k minus flow k - 1, minus the
+    upward move of the valve, plus the downward move of the valve, equals `targets[n + k]`. Flow
+    -1 counts as 0, so the element `targets[n]` is the last of the past flows, t/h. The later
+    elements of `targets` are 0.
     """
 
     A: Any  # sparse matrix of the plant, shape (n, n)
@@ -226,11 +229,11 @@ def _program(
     quiet: bool,
     price: Array,
 ) -> _Program:
-    """Return the linear program of `plan` for the flows after the first `past_count` flows.
+    """Return the linear program that chooses the flows after the first `past_count` flows.
 
-    `model`, `bounds`, `setpoint` and `quiet` are arguments of `plan`. `flow` has the past flows
-    and then zeros, t/h, shape (samples,). `price` has the price of each flow, degC per t/h,
-    shape (samples,).
+    `model`, `bounds`, `setpoint` and `quiet` are arguments of `plan`. `flow` has the
+    `past_count` past flows, which are fixed, and then zeros, t/h, shape (samples,). `price` has
+    the price of each flow, degC per t/h, shape (samples,).
     """
     samples = len(setpoint)
     first = past_count + 1  # sample of the first output after the past flows
@@ -300,9 +303,9 @@ def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
 def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
     """Return the equality constraints M x = r of a linear program: a sparse M and a vector r.
 
-    The vector x has the outputs if `with_outputs` is true, and then the flows, pieces and moves
-    of `program`. If `with_outputs` is false, the equations contain the effects of the flows on
-    the outputs instead of the outputs.
+    If `with_outputs` is true, the vector x has the outputs and then the flows, pieces and valve
+    moves of `program`. If `with_outputs` is false, x does not have the outputs, since the
+    equations express the outputs by the flows.
     """
     n = len(program.flows.cost)
     rows = len(program.targets)
@@ -335,15 +338,17 @@ def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
     """Return the plan of a controller that never expects another change of the set point.
 
     At each change of the set point, the controller chooses the flows that are best if the set
-    point never changes again. If the plant has settled before each change, no controller that
-    does not expect the changes has a smaller error. The reference is not a lower bound for all
-    controllers, since a controller may know the times of the changes of a square wave in
-    advance.
+    point never changes again. If the plant has settled before each change of the set point, no
+    controller that does not expect the changes has a smaller mean error than the plan. A
+    controller that knows the times of the set-point changes in advance, as of a square wave,
+    can have a smaller mean error than the plan, so the errors of the plan are not lower bounds
+    for all controllers.
 
     Parameters
     ----------
     model
-        The plant at `model.lag + LOOKAHEAD` samples more than `setpoint` has.
+        The plant at all samples of `setpoint`, and at `model.lag + LOOKAHEAD` or more samples
+        after them.
     bounds
         Lower bounds of the mean absolute errors for the plant `model`.
     setpoint

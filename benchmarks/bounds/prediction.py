@@ -17,7 +17,7 @@ SMALLEST_VARIANCE = 1e-8
 
 
 def noise_variance(model: LinearModel) -> Array:
-    """Return the variances of the errors of the best predictions, degC^2, shape (samples,).
+    """Return the error variances of the best output predictions, degC^2, shape (samples,).
 
     The best prediction of the output y(k) uses the transmitter's readings up to k - d - 1,
     where d is the plant's delay in samples. `model` is a plant with noise and without load at
@@ -28,10 +28,12 @@ def noise_variance(model: LinearModel) -> Array:
 
 
 def noise_covariance(model: LinearModel) -> Array:
-    """Return the covariances of the state x(k) of a plant without load, given readings up to k.
+    """Return the covariances of a plant's state x(k), given the readings up to k, without load.
 
-    `noise_system` describes the state. The covariances have the shape (samples, size, size),
-    where size is the length of the state, and are 0 if the transmitter has no noise.
+    The state x(k), which `noise_system` describes, has the latest outputs of the plant and the
+    latest values of the noise. The result has a covariance matrix for each sample k of an
+    episode, shape (samples, size, size), where size is the length of the state. The covariances
+    are 0 if the transmitter has no noise.
     """
     F, Q = noise_system(model)
     if model.numbers.measurement_noise_variance == 0.0:
@@ -40,12 +42,12 @@ def noise_covariance(model: LinearModel) -> Array:
 
 
 def noise_system(model: LinearModel) -> tuple[Array, Array]:
-    """Return F(k) and Q(k) of the state equation of a plant with noise and without load.
+    """Return the matrices F(k) and Q(k) of the state equation of a plant without load.
 
     The state equation is x(k) = F(k) x(k-1) + v(k), where x(k) is the state of
     `LinearModel.state_space`, whose first element is the output y(k), degC, and v(k) is white
-    noise with the covariance matrix Q(k). F and Q have the shape (samples, size, size), where
-    size is the length of x(k).
+    noise with the covariance matrix Q(k). The two returned arrays have the shape (samples,
+    size, size), where size is the length of the state x(k).
     """
     F, g = model.state_space()
     covariance = model.numbers.noise_variance * np.outer(g, g)
@@ -66,7 +68,7 @@ def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
     Returns
     -------
     ndarray
-        Covariances of x(k), shape (samples, size, size).
+        Covariances of the state x(k), given all readings up to k, shape (samples, size, size).
     """
     filtered = np.zeros_like(F)
     P = filtered[0]
@@ -90,13 +92,13 @@ def predicted_variance(filtered: Array, F: Array, Q: Array, lag: int) -> Array:
         where the first element of x(k) is y(k), and v(k) is white noise with the covariance
         matrix Q(k).
     lag
-        Number of samples to predict ahead.
+        Number of samples from the last known reading to the predicted output.
 
     Returns
     -------
     ndarray
-        Variances of y(k), degC^2, shape (samples,). For k below `lag`, y(k) is predicted from
-        the state x(0), which is known.
+        Variances of the output y(k), given the readings up to k - lag, degC^2, shape
+        (samples,). For k below `lag`, y(k) is predicted from the state x(0), which is known.
     """
     samples = len(F)
     steps = min(lag, samples)

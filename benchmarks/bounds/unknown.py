@@ -2,8 +2,8 @@
 
 The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k), with
 the output y, the flow u_a, the delay d and the white noise xi. A load w(k) adds A(1) w(k) to
-the right side of equation (28). The load is the sum of a random walk and of a piecewise
-constant part, whose changes are called *jumps*.
+the right side of equation (28) of the paper. The load is the sum of a random walk and of a
+piecewise constant part, whose changes are called *jumps*.
 
 A flow at sample j affects the output y(j + d + 1) at the earliest. So no flow counteracts the
 effects on y(k) of noise, random walk and jumps after the sample k - d - 1. Let n(k) be the sum
@@ -15,16 +15,11 @@ n(k) were 0. The error is
 The number m(k) is known at sample k - d - 1, and the random number n(k) has the mean 0, so E[e]
 = E[m]. The linear program in `linear_program.py` needs a lower bound of E|e| that is a convex,
 piecewise linear function of the expected error E[e]. Let K be everything that a controller
-knows at sample k - d - 1. For every slope s from -1 to 1,
-
-    E[|m - n| given K] >= s m + min over x of E[|x - n| - s x given K].
-
-The mean of this inequality over K is a lower bound of E|e| that is a line in E[e],
-
-    E|e| >= s E[e] + a(s).
-
-The intercept a(s) is the mean over K of the minimum over x of E[|x - n| - s x given K]. Three
-steps lead to a computable lower bound of the intercept a(s):
+knows at sample k - d - 1. For every slope s from -1 to 1, the mean of the error |e| = |m - n|,
+given K, is at least s m plus the minimum of E[|x - n| - s x given K] over all numbers x. The
+mean over K gives E|e| >= s E[e] + a(s), a lower bound of E|e| that is a line in E[e], where the
+intercept a(s) is the mean over K of the minimum over x of E[|x - n| - s x given K]. Three steps
+lead to a computable lower bound of the intercept a(s):
 
 1. K is assumed to contain more than any controller knows: the random walk and the piecewise
    constant part of the load up to sample k - d - 1. K does not contain the times of jumps after
@@ -44,8 +39,8 @@ steps lead to a computable lower bound of the intercept a(s):
    values are replaced by their means. Replacing values of n(k) by their mean never makes the
    mean of |x - n(k)| larger (Jensen's inequality).
 
-After step 3, n(k) has finitely many values, and the minimum over x is at one of these values, a
-quantile of n(k).
+After step 3, the random number n(k) has finitely many values, and the minimum over x of E[|x -
+n| - s x given K] is at one of these values, a quantile of n(k).
 """
 
 import math
@@ -86,9 +81,9 @@ SLOPES = 1.0 - np.array([64, 53, 42, 31, 22, 14, 8, 4, 1, 0]) / 64.0
 def error_bounds(model: LinearModel) -> ErrorBounds:
     """Return the lower bounds of the mean errors that noise and load cause, for each sample.
 
-    The description of the module derives the lower bounds, which assume that the controller
-    knows the load up to sample k - d - 1, where d is the plant's delay. No flow can counteract
-    the effects of noise and load in the last d + 1 samples.
+    The docstring of the module derives the lower bounds of the mean errors, which assume that
+    the controller knows the load up to sample k - d - 1, where d is the plant's delay. No flow
+    can counteract the effects of noise and load in the last d + 1 samples.
 
     Parameters
     ----------
@@ -117,7 +112,7 @@ def error_bounds(model: LinearModel) -> ErrorBounds:
 
 
 def bounds_for_normal(variance: Array) -> ErrorBounds:
-    """Return the lower bounds of the mean errors if the inevitable errors are normal.
+    """Return lower bounds of the mean errors if inevitable errors are normally distributed.
 
     The inevitable error is the part of the error that no flow can counteract in time. The
     inevitable error has the mean 0 and, at each sample, the variance `variance`, degC^2, shape
@@ -130,7 +125,7 @@ def bounds_for_normal(variance: Array) -> ErrorBounds:
 
 
 class LoadChanges(NamedTuple):
-    """The changes of the load that no controller knows when its flow can still affect y(k).
+    """The changes of the load that happen too late for any flow to counteract them at y(k).
 
     The flow at sample k - d - 1 is the last flow that can affect the output y(k), where d is
     the plant's delay in samples. The changes of the load at the samples from k - d to k are
@@ -138,12 +133,14 @@ class LoadChanges(NamedTuple):
     that is a multiple of `LOAD_INTERVAL`.
     """
 
-    # Effect on y(k), degC, of an unknown change of the load by 1 degC, in the order from the
-    # latest change to the earliest change. The effect is 0 if sample k has fewer unknown
-    # changes. Shape (samples, largest number of unknown changes).
+    # Row k: effects on y(k), degC, of changes of the load by 1 degC that happen from sample k -
+    # d to k, beginning with the latest change. The effect is 0 in columns that sample k does
+    # not need. Shape (samples, largest number of changes).
     effects: Array
-    counts: NDArray[np.intp]  # number of unknown changes, shape (samples,)
-    known_counts: NDArray[np.intp]  # number of changes up to k - d - 1, shape (samples,)
+    # Number of times at which the load can change from sample k - d to k, shape (samples,).
+    counts: NDArray[np.intp]
+    # Number of times at which the load can change up to sample k - d - 1, shape (samples,).
+    known_counts: NDArray[np.intp]
 
 
 def load_changes(model: LinearModel) -> LoadChanges:
@@ -165,7 +162,7 @@ def load_changes(model: LinearModel) -> LoadChanges:
     known_changes = np.maximum(k - model.lag, 0) // LOAD_INTERVAL
     largest_count = math.ceil(min(model.lag, samples) / LOAD_INTERVAL)
     effects = np.empty((samples, largest_count))
-    for place in range(largest_count):  # place 0 is the latest change
+    for place in range(largest_count):  # Column 0 is for the latest change.
         effects[:, place] = responses[k, np.maximum(changes - place, 0)]
     return LoadChanges(effects, changes - known_changes, known_changes)
 
@@ -175,9 +172,10 @@ def _after_jumps(
 ) -> list[Distribution]:
     """Return the distributions of the effect on y(k) of a jump of the load and all later jumps.
 
-    Item i of the list is the distribution if the first jump is at the change of the load in
-    column i of `effects`. The load keeps a new level until the next jump. The returned
-    distributions leave out the effect of the load's level before the first jump.
+    Item i of the returned list is the distribution of the effect on y(k) if the first jump is
+    at the change of the load to which column i of `effects` belongs. The load keeps a new level
+    until the next jump. The returned distributions leave out the effect of the load's level
+    before the first jump.
 
     Parameters
     ----------
@@ -212,19 +210,22 @@ def _effects_on_output(
 ) -> tuple[Distribution, Array]:
     """Return the distribution of n(k), the effect on y(k) that no flow can counteract in time.
 
-    The distribution of n(k) depends on l, the level of the load at sample k - d - 1, degC,
-    where d is the plant's delay. `_intercepts_with_jumps` describes the parameters.
+    The distribution of n(k), degC, depends on the level l, degC, of the load's piecewise
+    constant part at sample k - d - 1, where d is the plant's delay. The parameters are those of
+    `_intercepts_with_jumps`.
 
     Returns
     -------
     at_level_0 : Distribution
-        Distribution of n(k) if the level l of the load is 0 degC.
+        Distribution of the effect n(k) on y(k) if the load has the level 0 degC at sample
+        k - d - 1.
     effect_of_level : Array
-        Change of each value of `at_level_0` per degC of the level l, shape (samples, atoms).
+        Increase of each value of `at_level_0`, degC, if the load has the level 1 degC in place
+        of 0 degC at sample k - d - 1, shape (samples, atoms).
     """
     no_jump_probability = 1.0 - jump_probability
     # Either the load does not jump after sample k - d - 1, or the first jump is at one of the
-    # unknown changes.
+    # times to which the columns of `changes.effects` belong.
     parts = [noise]
     probabilities: list[Array] = [no_jump_probability ** changes.counts.astype(np.float64)]
     effects_of_level = [np.zeros_like(noise.values)]
@@ -244,13 +245,14 @@ def _effects_on_output(
 def _intercepts_with_jumps(
     changes: LoadChanges, noise: Distribution, amplitude: float, jump_probability: float
 ) -> Array:
-    """Return the intercepts a(s) for a load with jumps, degC, shape (samples, slopes).
+    """Return intercepts of lines below the mean errors if the load jumps, degC.
 
-    The description of the module defines the intercept a(s) for each slope s in `SLOPES`. The
-    intercepts are means over the level of the load at sample k - d - 1, where d is the plant's
-    delay. The level of the load is 0 until the first jump of the episode, and then uniformly
-    distributed from -`amplitude` to `amplitude`, degC. The load jumps with the probability
-    `jump_probability` at each sample at which the load can change.
+    The result has the shape (samples, slopes): for each sample k and each slope s in `SLOPES`,
+    it has the intercept a(s) of the line s E[e] + a(s), which is a lower bound of the mean
+    error E|e| at sample k. Each intercept a(s) is a mean over the level of the load at sample
+    k - d - 1, where d is the plant's delay. The level of the load is 0 until the first jump of
+    the episode, and then uniformly distributed from -`amplitude` to `amplitude`, degC. The load
+    jumps with the probability `jump_probability` at each sample at which the load can change.
 
     `changes` has the changes of the load that are unknown at sample k - d - 1, and `noise` is
     the distribution of the effect on y(k) of the noise xi and of the load's random walk, degC.

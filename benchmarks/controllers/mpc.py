@@ -38,15 +38,17 @@ class _Model:
     plants : LinearModel
         Plants of all runs.
     response : Array
-        Matrix G of each run, degC per t/h, shape (n, HORIZON, HORIZON). G times the planned
-        flows is the effect of the planned flows on the first HORIZON outputs that the planned
-        flows can affect.
+        Matrix of each run, from planned flows to changes of outputs, degC per t/h, shape (n,
+        HORIZON, HORIZON). The matrix of a run times the planned flows is the effect of the
+        planned flows on the first HORIZON outputs that they can affect.
     hessian : Array
-        Transpose of G times G, (degC per t/h)^2, shape (HORIZON, HORIZON, n). The axis of the
-        runs is last, because NumPy operations on all runs are faster in this order.
+        Transpose of `response` times `response` for each run, (degC per t/h)^2, shape (HORIZON,
+        HORIZON, n). The axis of the runs is last, because NumPy operations on all runs are
+        faster in this order.
     curvature : Array
         Second derivative of the cost of a plan by each planned flow, shape (HORIZON, n). If a
-        flow affects no output within the horizon, the curvature is `SMALLEST_CURVATURE`, not 0.
+        planned flow affects none of the HORIZON outputs, its curvature is `SMALLEST_CURVATURE`,
+        to avoid a division by 0.
     """
 
     plants: LinearModel
@@ -97,11 +99,11 @@ class PredictiveController:
     The mean absolute error is least if the median of the output is at the set point. So the
     controller forecasts medians of the outputs, and assumes that the load does not change. The
     planned flows lie within the limits of the actuator, and minimise the sum of squared
-    differences between forecast outputs and target outputs. The sum of squared differences has
-    HORIZON terms, beginning with the first output that the planned flows can affect. If the
-    first planned flow lies inside the dead zone, the controller replaces the flow by 0 or by
-    the flow at the edge of the dead zone, whichever gives the smaller sum of squared
-    differences.
+    differences between forecast outputs and target outputs. The sum of squared differences
+    between forecast and target outputs has HORIZON terms, beginning with the first output that
+    the planned flows can affect. If the first planned flow lies inside the dead zone, the
+    controller replaces the flow by 0 or by the flow at the edge of the dead zone, whichever
+    gives the smaller sum of squared differences.
 
     If set points are not random, the target outputs are equal to the present set point. If set
     points are random, `agents.hedge` computes the target outputs from the probability that the
@@ -149,7 +151,7 @@ class PredictiveController:
         ahead = np.arange(self._longest_delay + HORIZON + 1)[:, np.newaxis]
         samples_back = self._delay[:, np.newaxis, np.newaxis] + 1 + np.arange(len(parameters.b))
         self._flow_columns = np.maximum(samples_back - ahead, 0)
-        self._models: dict[int, _Model] = {}  # by first sample of a model
+        self._models: dict[int, _Model] = {}  # by the first sample at which the model holds
         self._random: RandomSetpoint | None = None
         levels = SetPointLevels(parameters)
         if levels.random and levels.amplitude > 0.0:
@@ -204,10 +206,10 @@ class PredictiveController:
     def _targets(self, setpoint: Array) -> Array:
         """Return the target outputs, degC, shape (runs, HORIZON), and store the set points.
 
-        Column i has the target of the first output that the planned flow i can affect.
-        `setpoint` has the present set points, degC, shape (runs,). `_targets` must be called
-        once a sample, since the method counts the samples since the latest change of the set
-        point.
+        Column i of the result has the target of the first output that planned flow i can
+        affect. `setpoint` has the present set points, degC, shape (runs,). `_targets` must be
+        called once a sample, since the method counts the samples since the latest change of the
+        set point.
         """
         if self._random is None:
             return np.broadcast_to(setpoint[:, np.newaxis], (len(setpoint), HORIZON))
@@ -223,8 +225,8 @@ class PredictiveController:
         """Return the standard deviation of the forecast error of each run, degC, shape (runs,).
 
         The forecast is the expected value of the first output that the next flow can affect.
-        For the result, the Kalman filter is brought to its steady state, with a plant that does
-        not drift.
+        The standard deviation is that of a Kalman filter in its steady state, for a plant that
+        does not drift.
         """
         self.reset()
         plants = self._model(0).plants
@@ -283,8 +285,8 @@ class PredictiveController:
     def _predict(self) -> Array:
         """Return the expected outputs if all flows from the present sample k on are 0, degC.
 
-        Column i has the output y(k + 1 + i) of all runs. The number of columns is HORIZON plus
-        the longest delay of a run.
+        Column i of the result has the expected output y(k + 1 + i) of each run. The number of
+        columns is HORIZON plus the longest delay of a run in samples.
         """
         runs = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
         flows = self._flows[runs, self._flow_columns[:, 1:]]
@@ -296,7 +298,7 @@ class PredictiveController:
         noise = self._state[:, order:LOAD_STEPS]  # xi(k), xi(k-1), ...
         load = self._state[:, LOAD_STEPS] + self._state[:, LOAD_WALK]
         outputs = [self._state[:, i] for i in reversed(range(order))]  # the newest last
-        for ahead, plants in enumerate(models, start=1):  # y(k + ahead)
+        for ahead, plants in enumerate(models, start=1):  # Forecast y(k + ahead).
             output = effects[:, ahead - 1] + plants.load_factor * load
             for i in range(plants.alpha.shape[-1]):
                 output += plants.alpha[:, i] * outputs[-1 - i]
@@ -308,8 +310,8 @@ class PredictiveController:
     def _model(self, k: int) -> _Model:
         """Return the model of all runs' plants in the step from sample k - 1 to sample k.
 
-        The method stores the models, since the plants change only every `DRIFT_INTERVAL`
-        samples.
+        The method keeps each model for later calls, since plants change only every
+        `DRIFT_INTERVAL` samples.
         """
         first = 0
         if self._parameters.drifts:
@@ -327,7 +329,8 @@ class PredictiveController:
         A first flow inside the dead zone is replaced by 0 or by the flow at the edge of the
         dead zone, whichever gives the plan with the lower cost after the later flows have been
         planned anew. A plan has the planned flows of all runs, t/h, shape (HORIZON, runs). The
-        command is in t/h, shape (runs,). `slopes` is the argument of `_Model.cost`.
+        returned command is in t/h and has the shape (runs,). `slopes` has the negative
+        derivative of the cost by each planned flow, at a plan of zeros, as in `_Model.cost`.
         """
         numbers = self._numbers
         flow = plan[0]
@@ -351,11 +354,13 @@ class PredictiveController:
         start: Array,
         first_flow: Array | float | None = None,
     ) -> Array:
-        """Return the plan with the least cost within the limits, t/h, shape (HORIZON, runs).
+        """Return the flows with the least cost within the limits, t/h, shape (HORIZON, runs).
 
-        Coordinate descent finds the plan, beginning with the planned flows `start`, t/h, shape
-        (HORIZON, runs). If `first_flow` is not None, the first planned flow is `first_flow`,
-        t/h, a number or an array of shape (runs,). `slopes` is the argument of `_Model.cost`.
+        Coordinate descent finds the flows, beginning with the flows `start`, t/h, shape
+        (HORIZON, runs), where runs is the number of runs of the batch. If `first_flow` is not
+        None, the first planned flow is `first_flow`, t/h, a number or an array with a number
+        for each run of the batch. `slopes` has the negative derivative of the cost by each
+        planned flow, at a plan of zeros, as in `_Model.cost`.
         """
         plan = start.copy()
         free_flows = range(HORIZON)

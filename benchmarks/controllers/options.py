@@ -35,7 +35,7 @@ MODULE_NAME = re.compile(r"\w+(\.(?!py$)\w+)*")
 @options
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
-    """The options `--agent` for a user's own controllers, `--jobs` and `--backend`."""
+    """The options `--agent`, `--jobs` and `--backend`: own controllers and parallel tasks."""
 
     agent: Names = ()
     """A controller of your own, which runs in addition to those of --agents. Its form is
@@ -173,7 +173,12 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
 
 
 def _with_searched_gains(name: str, file: Path) -> ControllerSpec:
-    """Return the `ControllerSpec` of a controller with gains from a `benchmarks.tune` file."""
+    """Return the `ControllerSpec` of a controller with gains from a `benchmarks.tune` file.
+
+    The JSON file `file` has the controller's name in `ROSTER`, the gains, the plant on which
+    the gains were searched, and two texts for tables: the element "knows" describes the
+    controller's prior knowledge, and the element "searched" says how the gains were searched.
+    """
     content = json.loads(file.read_text(encoding="utf-8"))
     return replace(
         ROSTER[content["controller"]].with_gains(content["gains"]),

@@ -156,7 +156,7 @@ def _factory_of_zip(location: str) -> Factory:
     """Return a factory that returns the Stable-Baselines3 model at ALGORITHM:FILE.zip.
 
     A file that `mptc_gym.sb3.save` wrote describes the environment that the model acts in. If
-    another function wrote the file, the model acts in `MiddlePoint-v0` without wrappers.
+    another function wrote the zip file, the model acts in `MiddlePoint-v0` without wrappers.
     """
     import stable_baselines3  # imported here, as PyTorch takes seconds to load
 
@@ -188,7 +188,8 @@ def observation_of(factory: Factory) -> Mapping[str, int]:
     """Return how many samples of each signal the policies of a factory observe.
 
     The keys of the result are arguments of the environment, such as "error_window". If the
-    factory has no attribute `observation`, the policies get the observation of the paper.
+    factory has no attribute `observation`, the policies observe as many samples of each signal
+    as the controllers of the paper.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from benchmarks.loop.linear import nominal
 from mptc_gym import Parameters
 
-# Two plants count as different if one of the quantities differs by more than this factor.
+# Two plants count as different if a quantity in `PlantScale` differs by more than this factor.
 LARGEST_RATIO = 2.0
 PAPER = Parameters()  # the paper's plant
 # The intervals in which a search on the paper's plant looks for each gain of a controller.
@@ -25,7 +25,8 @@ NN_SPANS = {
     "weight_scale": (0.05, 2.0),
 }
 
-# The interval of each gain, by name. The end of smaller magnitude comes first.
+# The interval in which a search looks for each gain, by the name of the gain. The end of
+# smaller magnitude comes first.
 Spans = Mapping[str, tuple[float, float]]
 
 
@@ -57,7 +58,7 @@ def direction(plant: Parameters) -> int:
 
 
 def scale_of(plant: Parameters) -> PlantScale:
-    """Return the scale of the nominal plant, which is in the middle of `plant`'s ranges."""
+    """Return the `PlantScale` of the nominal plant, in the middle of all ranges in `plant`."""
     model = nominal(plant)
     gain = abs(float(model.gain))
     half_range = (model.numbers.u_max - model.numbers.u_min) / 2.0  # t/h
@@ -93,10 +94,10 @@ def difference(plant: Parameters, made_for: Parameters) -> str:
 
 
 def _finite_scale_of(plant: Parameters) -> PlantScale:
-    """Return the scale of a plant on which a search for gains is to run.
+    """Return the `PlantScale` of a plant on which a search for gains is to run.
 
-    A ValueError is raised if a quantity is 0 or infinite, since the ends of the search
-    intervals are proportional to ratios of quantities.
+    A ValueError is raised if the gain or another quantity of the plant is 0 or infinite, since
+    the ends of the search intervals are computed from these quantities.
     """
     scale = scale_of(plant)
     for name, value in vars(scale).items():
@@ -158,10 +159,10 @@ def dahlin_spans(plant: Parameters) -> Spans:
 
 
 def _scaled(spans: Spans, factors: Mapping[str, float]) -> Spans:
-    """Return the intervals of gains, with both ends of each interval multiplied by a factor.
+    """Return search intervals of gains, with both ends of each interval multiplied by a factor.
 
-    `spans` has the interval of each gain, and `factors` has the factor of each gain, both by
-    the name of the gain.
+    By the name of each gain, `spans` has the interval in which a search looks for the gain, and
+    `factors` has the factor for this interval.
     """
     scaled = {}
     for name, (first, last) in spans.items():

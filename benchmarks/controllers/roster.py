@@ -83,10 +83,9 @@ def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
 def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -> Agent:
     """Return a trained policy, adapted to the actuator of a plant.
 
-    The returned policy has the flow limits `u_min` and `u_max` (t/h) of the argument `limits`.
-    A policy that compensates the dead zone of the plants of the training compensates the dead
-    zone of `parameters` instead, unless this dead zone has a range.
-
+    `limits` has the flow limits `u_min` and `u_max` of the returned policy, t/h. If the policy
+    was trained to compensate for a dead zone, the returned policy compensates for the dead zone
+    in `parameters` instead, unless the dead zone in `parameters` is a range.
     """
     increments = network.increments
     dead_zone = parameters.dead_zone

@@ -139,15 +139,16 @@ class ControllerSpec:
         Function that returns the controller's trained networks by file name. A member of the
         controller is the controller with one of the networks; commands run all members.
     networks_are_alike : bool
-        Whether the networks hardly differ, so that most comparisons run only one network.
+        Whether the trained networks of the controller hardly differ, so that most comparisons
+        run only one of them.
     random : bool
         Whether the controller draws random numbers, such as initial weights.
     learns : bool
         Whether the controller goes on learning from one run to the next.
     spans : callable, optional
         Function that takes a plant, and returns the interval in which a search looks for each
-        gain. Both ends of the interval have the same sign, and the first end has the smaller
-        magnitude.
+        gain. Both ends of a search interval have the same sign, and the first end has the
+        smaller magnitude.
     compared : bool
         Whether the command `compare` runs the controller by default.
     swept : bool
@@ -219,8 +220,8 @@ class ControllerSpec:
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
         """Return a copy in which arguments of `build`, by name, have the fixed values `gains`.
 
-        If `gains` has a value for the argument `tuned_by`, `robust_time_constant` no longer
-        chooses that value.
+        If `gains` has a value for the argument that `tuned_by` names, `robust_time_constant` no
+        longer chooses this argument.
         """
         tuned_by = "" if self.tuned_by in gains else self.tuned_by
         return replace(self, build=partial(self.build, **gains), tuned_by=tuned_by)
@@ -238,11 +239,12 @@ class ControllerSpec:
         return self.build(**arguments)
 
     def robust_time_constant(self, plant: Mapping[str, Any]) -> float:
-        """Return the smallest time constant, s, with a maximum sensitivity of `sensitivity`.
+        """Return the smallest time constant, s, with which the control loop is robust enough.
 
-        The time constant is that of the argument `tuned_by` of `build`, and the maximum
-        sensitivity is that of the control loop with the nominal plant. The time constant is
-        rounded to four digits, so that all machines return the same number.
+        The time constant is the argument of `build` that `tuned_by` names. The control loop
+        with the nominal plant is robust enough if its maximum sensitivity Ms is at most
+        `sensitivity`. The time constant is rounded to four digits, so that all machines return
+        the same number.
         """
         parameters = Parameters(**plant)
         arguments = knowledge(self.prior_knowledge, parameters, 1, 0)

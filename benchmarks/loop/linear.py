@@ -1,13 +1,11 @@
 """Describe the plant, and the closed loop of a controller and the plant, as linear systems.
 
-The plant is equation (28) of the paper with a load:
-
-    y(k) = sum_i alpha_i y(k-1-i) + sum_i beta_i u_a(k-d-1-i) + C(z^-1) xi(k) + A(1) w(k).
-
-The index i counts from 0, y is the temperature (degC), u_a the flow that the actuator applies
-(t/h), d the delay (samples), xi white noise (degC) and w the load (degC). The coefficients
-alpha_i and beta_i are -a_(i+1) and b_i of the polynomials A and B, changed by the factors and
-the drifts of the gain and of the time constant.
+The plant is equation (28) of the paper with a load, y(k) = sum_i alpha_i y(k-1-i) + sum_i
+beta_i u_a(k-d-1-i) + C(z^-1) xi(k) + A(1) w(k), where the index i counts from 0, y is the
+temperature (degC), u_a the flow that the actuator applies (t/h), d the delay (samples), xi
+white noise (degC) and w the load (degC). The coefficients alpha_i and beta_i are -a_(i+1) and
+b_i of the polynomials A and B, changed by the factors and the drifts of the gain and of the
+time constant.
 """
 
 import itertools
@@ -50,8 +48,8 @@ class LinearModel:
 
     A model has several plants at one sample k, or one plant at several samples k, or one plant
     at one sample. The coefficients of a plant that drifts hold for the step from sample k - 1
-    to sample k. In the shapes of arrays, dots stand for the axis of the plants or of the
-    samples. A model of one plant at one sample has no axis in place of the dots.
+    to sample k. In the shapes of arrays, three dots stand for the axis of the plants or of the
+    samples, which the arrays of one plant at one sample do not have.
 
     Parameters
     ----------
@@ -118,8 +116,9 @@ class LinearModel:
         """Number of samples from a flow to the first output that the flow can affect.
 
         By equation (28) of the paper, a flow at sample j affects the output y(j + d + 1) at the
-        earliest, where d is the plant's delay. So the lag is d + 1, plus the number of leading
-        zeros among the coefficients of the polynomial B. The model must have one plant.
+        earliest, where d is the plant's delay. So the lag of a plant with the delay d is d + 1,
+        plus the number of leading zeros among the coefficients of the polynomial B. The model
+        must have one plant.
         """
         # The appended 1 is the first nonzero number if all coefficients of B are 0.
         first_nonzero = np.flatnonzero([*self.parameters.b, 1.0])[0]
@@ -135,8 +134,8 @@ class LinearModel:
 
         The first value is the effect of a flow of 1 t/h at one sample on the output d + 1
         samples later, where d is the delay of the plant in samples. The impulse response is
-        computed without drift of the plant. The dots in the shape stand for the axis of the
-        plants.
+        computed without drift of the plant. In the shape (..., samples), the dots stand for the
+        axis of the plants.
         """
         response = np.zeros((*self.load_factor.shape, samples))
         response[..., : self.beta.shape[-1]] = self.beta[..., :samples]
@@ -192,7 +191,8 @@ class LinearModel:
         no_jump_probability
             Probability that the piecewise constant part of the load does not jump at sample k,
             a number for each plant or sample. A jump leads to a level with the mean 0, so the
-            mean of the piecewise constant part is multiplied by this probability at sample k.
+            mean of the piecewise constant part is multiplied by the probability of no jump at
+            sample k.
 
         Returns
         -------
@@ -200,7 +200,8 @@ class LinearModel:
             State transition matrix, for each plant or sample, shape (..., size, size), where
             size is the length of the state.
         E : Array
-            Effects of v(k) on each element of the state, shape (..., size, 3).
+            Effects of the three elements of v(k) on each element of the state, shape (...,
+            size, 3).
         """
         F_noise, g = self.state_space()
         size = len(g) + 2
@@ -338,7 +339,7 @@ class LinearLoop:
     def characteristic(self, delay: int) -> Array:
         """Return the loop's characteristic polynomial for a plant delay of `delay` samples.
 
-        The array has the coefficients of z^0, z^-1, z^-2 and so on. The zeros of the
+        The returned array has the coefficients of z^0, z^-1, z^-2 and so on. The zeros of the
         characteristic polynomial in z are the poles of the loop.
         """
         delayed_numerator = np.append(np.zeros(delay), self.numerator)
@@ -365,8 +366,8 @@ class LinearLoop:
     def sensitivity(self) -> float:
         """Return the maximum sensitivity Ms of the loop; infinite for an unstable loop.
 
-        Ms is the largest magnitude of the sensitivity function 1 / (1 + L) at the
-        `FREQUENCIES`, where L is the transfer function from the error to the temperature.
+        Ms is the largest magnitude of the sensitivity function 1 / (1 + L) at the frequencies
+        in `FREQUENCIES`, where L is the transfer function from the error to the temperature.
         """
         if not self.is_stable(self.delay):
             return math.inf

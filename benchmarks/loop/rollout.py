@@ -221,9 +221,10 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
 
 
 def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
-    """Return the contributions of three parts of a run to the mean error, degC, by name.
+    """Return what the start, the set-point changes and the rest of a run add to its mean error.
 
-    The arrays of contributions have the shape (runs,). `measure` describes the three parts.
+    The returned dict has the measures `mae_start`, `mae_changes` and `mae_steady` of `measure`
+    by name, degC, in arrays of shape (runs,).
     """
     errors = np.abs(trajectory.next_error)
     k = np.arange(1, len(errors) + 1)[:, np.newaxis]
@@ -242,10 +243,10 @@ def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
 
 
 def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]:
-    """Return the shares of commands in the dead zone and at a limit, %, each of shape (runs,).
+    """Return the percentages of commands in the dead zone and at a limit, of shape (runs,).
 
-    The shares are NaN if the dead zone or a limit in `parameters` is a range. `command` has the
-    commanded flows, t/h, shape (samples, runs).
+    The percentages are NaN if the dead zone or a limit of the flow in `parameters` is a range.
+    `command` has the commanded flows, t/h, shape (samples, runs).
     """
     if {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
         unknown = np.full(command.shape[1], np.nan)
