@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 import os
 from dataclasses import dataclass, field
@@ -154,7 +155,8 @@ def read_log(options: Options) -> Log:
             f"{flow.max():g}, got {centre:g}"
         )
     disturbances = filled[[*options.disturbance]].to_numpy()
-    return Log(flow, temperature.to_numpy(), disturbances, interval)
+    missing_flows = float(numbers[options.flow].isna().mean())
+    return Log(flow, temperature.to_numpy(), disturbances, interval, missing_flows)
 
 
 def read_table(path: Path) -> tuple[pd.DataFrame, str]:
@@ -167,7 +169,7 @@ def read_table(path: Path) -> tuple[pd.DataFrame, str]:
     import pandas as pd
 
     try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
+        text = decoded(path.read_bytes()).rstrip()
         heading = text.partition("\n")[0]
         separator = next((mark for mark in ";\t" if mark in heading), ",")
         table = pd.read_csv(
@@ -189,6 +191,19 @@ def read_table(path: Path) -> tuple[pd.DataFrame, str]:
     return table.apply(lambda column: column.str.strip()), separator
 
 
+def decoded(content: bytes) -> str:
+    """Return the text of a file in UTF-8, in UTF-16 with a byte order mark, or in Windows-1252.
+
+    Spreadsheets write Windows-1252 in western Europe, for instance in the heading "Temp °C".
+    """
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", errors="replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252", errors="replace")
+
+
 def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
     """Return the numbers in a column of strings, with NaN for empty cells.
 
@@ -204,10 +219,11 @@ def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
     marked = column[has_mark]
     looks_like_thousands = bool(has_mark.any() and marked.str.fullmatch(THOUSANDS).all())
     if separator != ",":
-        # A point or a comma is often a decimal mark in such a file. If a separator of thousands
-        # is read as a decimal mark, the largest numbers of the column become the smallest.
+        # A point or a comma is often a decimal mark in such a file. It separates thousands if
+        # this makes the marked numbers continue the range of the others: 850, 900, 1.100.
         sizes = numbers.abs()
-        looks_like_thousands &= bool(sizes[has_mark].max() < sizes[~has_mark].min())
+        smallest_with_thousands = 1000.0 * sizes[has_mark].min()
+        looks_like_thousands &= bool(smallest_with_thousands < 10.0 * sizes[~has_mark].max())
     if looks_like_thousands:
         raise UsageError(
             f"line {marked.index[0] + 2}: {column.name} must not have separators of thousands, "
@@ -296,8 +312,8 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
     of the temperature's variance that the model explains, a result of `explained_share`.
     """
     sentences = []
-    last_third = fit.log.flow[-(len(fit.log.flow) // 3) :]
-    if np.ptp(last_third) == 0.0:
+    log = fit.log
+    if not can_be_checked(log):
         sentences.append(
             "The flow is constant in the last third of the log, so the model could not be "
             "checked on new rows."
@@ -320,7 +336,28 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
         sentences.append(
             "The interval of the gain contains 0: the sign of the gain is unknown."
         )
-    return sentences + doubts_about_sensor(fit.log.temperature)
+    if intervals.high["time_constant"] > 4.0 * intervals.low["time_constant"]:
+        sentences.append(
+            "The interval of the time constant is wide: the plant may have more lags than the "
+            "model, or the log shows no undisturbed response. Do not use ranges.json."
+        )
+    if log.missing_flows > 0.01:
+        sentences.append(
+            f"{100 * log.missing_flows:.0f} % of the flows are missing and were replaced by "
+            "the flow of the row before: the delay and its interval are not reliable if the "
+            "flow changes in most rows."
+        )
+    if log.sampling_interval < 0.1:
+        sentences.append(
+            f"The sampling interval is {log.sampling_interval:g} s: the times are perhaps in "
+            "another unit than seconds."
+        )
+    return sentences + doubts_about_sensor(log.temperature)
+
+
+def can_be_checked(log: Log) -> bool:
+    """Return whether the flow changes in the last third of a log."""
+    return bool(np.ptp(log.flow[-(len(log.flow) // 3) :]) > 0.0)
 
 
 def is_white(errors: NDArray[np.float64]) -> bool:
@@ -353,6 +390,13 @@ def doubts_about_sensor(temperature: NDArray[np.float64]) -> list[str]:
     if longest > max(20, len(temperature) / 20):
         sentences.append(
             f"The temperature is frozen: {longest} rows in succession have the same value."
+        )
+    low, high = np.quantile(temperature, [0.01, 0.99])
+    is_outlier = np.abs(temperature - (low + high) / 2.0) > 3.0 * (high - low)
+    if 0 < np.sum(is_outlier) < len(temperature) / 100.0:
+        sentences.append(
+            f"{np.sum(is_outlier)} temperatures lie far outside the range of the others: "
+            f"remove values that are not measurements, such as {temperature[is_outlier][0]:g}."
         )
     return sentences
 
@@ -434,10 +478,14 @@ def findings(
     `explained_share`, and `arguments` is a result of `plant_arguments`.
     """
     log, centre = fit.log, fit.zone.centre
-    text = [
-        f"The model explains {100 * max(explained, 0.0):.1f} % of the variance of the "
-        "temperature in the last third of the log, when it is fitted to the first two thirds "
-        "and simulates the last third from the flow and the measured disturbances.",
+    text = []
+    if can_be_checked(log):
+        text.append(
+            f"The model explains {100 * max(explained, 0.0):.1f} % of the variance of the "
+            "temperature in the last third of the log, when it is fitted to the first two "
+            "thirds and simulates the last third from the flow and the measured disturbances."
+        )
+    text += [
         f"The log has {len(log.flow):,} samples of {log.sampling_interval:g} s.",
         "The delay is in samples, the time constant in seconds, the dead zone (half of its "
         "width) in the unit of the flow, and the gain in the unit of the temperature per unit "
@@ -447,6 +495,12 @@ def findings(
         f"{centre + arguments['u_min']:.4g} and {centre + arguments['u_max']:.4g}. The numbers "
         "in plant.json are deviations from the operating point.",
     ]
+    if fit.unknowns.fast > 0.0:
+        fast = log.sampling_interval * fit.unknowns.fast
+        text.append(
+            "The plant has two lags. The table has the larger time constant; the smaller time "
+            f"constant is {fast:.3g} s."
+        )
     if fit.load_steps:
         minutes = [log.sampling_interval * row / 60.0 for row in sorted(fit.load_steps)]
         times = ", ".join(f"{minute:.0f}" for minute in minutes)

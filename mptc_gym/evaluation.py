@@ -10,12 +10,14 @@ from importlib import resources
 from typing import Any, Final, NamedTuple, NoReturn
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from mptc_gym.environments.layers import plant_groups
 from mptc_gym.plant.checks import MOST_PLANTS, count
 from mptc_gym.plant.dynamics import action_from_command
 from mptc_gym.plant.parameters import ARGUMENTS, Parameters
+from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.scoring.fit import check_fit
 from mptc_gym.scoring.opening import Plants, opened
 from mptc_gym.scoring.policies import start
@@ -214,11 +216,13 @@ valve travel 10 t/h; 100 episodes, all alike
                 "env must have the same plants in all environments; only observation windows "
                 "and rewards may differ"
             )
-        runs = _run(policy, plants, seeds, parameters)
+        # An environment of a user may differ from what its attributes say.
+        is_made_here = isinstance(env, str | EnvSpec) and type(plants) is MiddlePointVectorEnv
+        runs = _run(policy, plants, seeds, parameters, is_replayed=not is_made_here)
     bound = find_bound(case, runs.length, seeds)
     notes = [bound.why_not, _why_idle(runs.travels, parameters)]
     evaluation = Evaluation(
-        env=groups[0].name,
+        env=_name_with_changes(groups[0].name, case),
         mean_error=float(runs.errors.mean()),
         travel=float(runs.travels.mean()),
         errors=runs.errors,
@@ -239,14 +243,32 @@ class _Runs(NamedTuple):
     length: int  # number of samples N of each episode
 
 
-def _run(policy: Any, plants: Plants, seeds: range, parameters: Parameters) -> _Runs:
-    """Return the mean errors and valve travels of a policy in one episode for each seed."""
+def _name_with_changes(name: str, case: Parameters) -> str:
+    """Return the name of an environment, with the arguments that differ from those of its id.
+
+    `name` is an id, or the name of a class; `case` has the arguments of the environment.
+    """
+    presets = {id_of_preset: preset for preset, id_of_preset in IDS.items()}
+    if name not in presets:
+        return name
+    own = case_of(Parameters(**PRESETS[presets[name]]))
+    changed = [key for key, value in asdict(case).items() if value != getattr(own, key)]
+    return f"{name} with another {', '.join(changed)}" if changed else name
+
+
+def _run(
+    policy: Any, plants: Plants, seeds: range, parameters: Parameters, *, is_replayed: bool
+) -> _Runs:
+    """Return the mean errors and valve travels of a policy in one episode for each seed.
+
+    If `is_replayed` is true, a second simulation checks the episodes.
+    """
     n = plants.num_envs
     rounds: list[_Runs] = []
     for first in seeds[::n]:
         seeds_of_round = [*range(first, first + n)]
         samples = rollout(plants, start(policy, n), SAMPLES, seeds_of_round)
-        if type(plants) is not MiddlePointVectorEnv:  # wrappers may change the episodes
+        if is_replayed:
             samples = replayed(samples, parameters, seeds_of_round)
         rounds.append(_measure(samples, n))
         if rounds[-1].length != rounds[0].length:

@@ -145,9 +145,6 @@ WAYS = {
 }
 REFUSED = {
     "line 4: flow must not have separators of thousands, got '1,480'": table('16,"1,480" ,1'),
-    "line 4: flow must not have separators of thousands, got '1.480'": table(
-        "16,1.480,1"
-    ).replace(",", ";"),
     "line 4 comes 11.6 s after the line before, but most time steps are 8": table("19.6,5,1"),
     "line 10 comes .* dates begin with the month, write .* 2025-12-31": (
         dated("%m/%d/%Y %H:%M:%S", "01/02/2026 23:59:00")
@@ -158,6 +155,7 @@ DOUBTS = {
     "in the last third": lambda y: y * np.linspace(2.0, -2.0, 1200),
     "a historian": lambda y: np.interp(np.r_[:1200], np.r_[:1200:20], y[::20]),
     "100 rows in succession": lambda y: np.r_[y[:99], np.full(100, 3.0), y[199:]],
+    "3 temperatures lie far outside": lambda y: np.where(np.r_[:1200] % 500 == 9, -400.0, y),
 }
 
 
@@ -183,6 +181,34 @@ class TestLog:
     def test_what_cannot_be_used_is_named(self, complaint, tmp_path):
         with pytest.raises(UsageError, match=complaint):
             read(REFUSED[complaint], tmp_path)
+
+    def test_thousands_beside_a_stopped_pump_are_refused(self, tmp_path):
+        rows = [f"{8 * k};{('0', '850', '1.100')[k % 3]};{k % 7}.25" for k in range(120)]
+        with pytest.raises(UsageError, match=r"line 4: flow .* got '1.100'"):
+            read("\n".join(["time;flow;temperature", *rows]), tmp_path)
+
+    @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
+    def test_names_of_columns_in_any_encoding(self, encoding, tmp_path):
+        path = tmp_path / "log.csv"
+        path.write_text(table().replace("temperature", "Temp °C") + "\n\n", encoding=encoding)
+        assert read_log(Options(path, temperature="Temp °C")).temperature[0] == 0.25
+
+    def test_missing_flows_are_a_warning(self, tmp_path):
+        text = EXAMPLE.read_text().splitlines()
+        for row in range(50, 150):
+            time, _, temperature = text[row].split(",")
+            text[row] = f"{time},,{temperature}"
+        log = read("\n".join(text), tmp_path)
+        fit = identify(log)
+        assert "8 % of the flows are missing" in " ".join(doubts(fit, estimates(fit), 1.0))
+
+    def test_unknown_time_constants_and_odd_times_are_warnings(self):
+        intervals = estimates(fit_of_paper())
+        intervals.loc["time_constant", "high"] = 5.0 * intervals.low["time_constant"]
+        fit = replace(fit_of_paper(), log=replace(fit_of_paper().log, sampling_interval=0.01))
+        text = " ".join(doubts(fit, intervals, 1.0))
+        assert "interval of the time constant is wide" in text
+        assert "another unit than seconds" in text
 
     @pytest.mark.parametrize("words", DOUBTS)
     def test_what_makes_a_log_doubtful_is_a_warning(self, words):

@@ -19,7 +19,7 @@ import pytest
 import torch
 from gymnasium import wrappers
 from gymnasium.spaces import Box, Dict, Discrete
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorWrapper
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.monitor import Monitor
@@ -32,7 +32,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from agents import DirectNNController, PIController
-from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, evaluate
+from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, Parameters, evaluate
 from mptc_gym.environments.layers import layers
 from mptc_gym.evaluation import SEED
 from mptc_gym.sb3 import load, make_vec_env, save, spec_of
@@ -628,6 +628,85 @@ def test_it_is_refused_by_a_rule(name):
         evaluate(policy, env, episodes=EPISODES, **(SHORT if env == NOISY else {}))
 
 
+def tampered():
+    """Return plants without delay that say that they are those of the paper."""
+    plants = MiddlePointVectorEnv(EPISODES, delay=0)
+    plants.parameters = Parameters()
+    return plants
+
+
+class Flattering(VectorWrapper):
+    """Give infos whose errors are small for those who look them up by name."""
+
+    class Infos(dict):
+        """Infos with smaller errors."""
+
+        def __getitem__(self, name):
+            return super().__getitem__(name) * (0.1 if name == "error" else 1.0)
+
+    def step(self, actions):
+        *results, infos = self.env.step(actions)
+        return *results, self.Infos(infos)
+
+
+@pytest.mark.parametrize("make", [tampered, lambda: Flattering(MiddlePointVectorEnv(EPISODES))])
+def test_plants_that_lie_about_themselves_are_refused(make):
+    with pytest.raises(ValueError, match="env must run the episodes of its seeds"):
+        evaluate(law, make(), episodes=EPISODES)
+
+
+def test_infos_in_arrays_that_are_used_again_give_the_same_valve_travel():
+    class Reusing(VectorWrapper):
+        def step(self, actions):
+            *results, infos = self.env.step(actions)
+            if not hasattr(self, "infos"):
+                self.infos = {name: np.array(value) for name, value in infos.items()}
+            for name, value in infos.items():
+                self.infos[name][:] = value
+            return *results, self.infos
+
+    plants = MiddlePointVectorEnv(EPISODES, max_episode_steps=100)
+    travels = [
+        evaluate(law, env, episodes=EPISODES).travels.tolist()
+        for env in (plants, Reusing(plants))
+    ]
+    assert travels[0] == travels[1]
+    assert max(travels[0]) > 0.0
+
+
+def test_an_environment_that_copies_as_itself_is_reset_afterwards():
+    class Single(MiddlePointEnv):
+        def __deepcopy__(self, memo):
+            return self
+
+    env = in_mid_episode(Single())
+    evaluate(law, env, episodes=2)
+    with pytest.raises(ValueError, match=r"cannot be copied .*returns the original"):
+        evaluate(model_of(PPO, DummyVecEnv([lambda: env])), env, episodes=2)
+
+
+def test_a_module_gets_observations_in_the_type_of_its_weights():
+    class Counting(Network):
+        def __init__(self):
+            super().__init__()
+            self.steps = torch.nn.Parameter(torch.tensor(3), requires_grad=False)
+            # The first of the parameters.
+            self._parameters = {"steps": self.steps, **self._parameters}
+
+    networks = Network(), Counting()
+    errors = [evaluate(network, NOISY, episodes=2).errors.tolist() for network in networks]
+    assert errors[0] == errors[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [({"delay": 3, "dead_zone": 1.0}, f"{NOISY} with another delay, dead_zone"),
+     ({"action_window": 9, "noise_variance": 0.5}, NOISY)],
+)  # fmt: skip
+def test_the_name_says_which_arguments_are_not_those_of_the_id(arguments, name):
+    assert evaluate(law, NOISY, episodes=2, **arguments).env == name
+
+
 BAD_IDS = "", " ", "a\0b", "MiddlePoint-v0\n", "no_such_module:Plant-v0"
 
 
@@ -637,6 +716,7 @@ BAD_IDS = "", " ", "a\0b", "MiddlePoint-v0\n", "no_such_module:Plant-v0"
         ({"env": one, "delay": 3}, "delay must be given where env is made"),
         ({"delay": -1}, "delay must be"),
         *(({"env": env}, "env must be the id of an environment .") for env in BAD_IDS),
+        ({"env": "hard"}, "write MiddlePointHard-v0 for the preset hard"),
         ({"seed": -1}, "seed must be an integer from 0"),
         *(({"episodes": n}, "episodes must be an integer from 2") for n in (1, 2.5, "many")),
     ],

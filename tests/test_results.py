@@ -99,6 +99,31 @@ class TestFolder:
         with pytest.raises(UsageError, match="holds files that no run wrote: remove it"):
             run(target, {})
 
+    @pytest.mark.parametrize("name", [".toy.earlier", "toy.unfinished"])
+    def test_files_beside_the_folder_are_never_removed(self, name, target):
+        other = target.with_name(name)
+        other.mkdir()
+        (other / "thesis.tex").write_text("years of work")
+        (other / "run.json").write_text('{"title": "thesis"}')
+        with pytest.raises(UsageError, match="holds files that"):
+            run(target, {"report.md": "new"})
+        assert (other / "thesis.tex").read_text() == "years of work"
+        assert contents(target) == {"report.md": "old", "old.csv": "1"}
+
+    def test_odd_things_in_the_way_are_named(self, target):
+        unfinished(target).write_text("a file")
+        with pytest.raises(UsageError, match=r"toy\.unfinished must be a folder"):
+            run(target, {})
+        unfinished(target).unlink()
+        (target / "run.json").write_text("[1]")
+        with pytest.raises(UsageError, match="did not write"):
+            run(target, {})
+        lock = target.with_name(".other.lock")
+        lock.mkdir()
+        for name in ("other", 300 * "x"):
+            with pytest.raises(UsageError, match=r"--out: .* cannot be used: "):
+                run(target.with_name(name), {})
+
     @pytest.mark.parametrize(
         ("folder", "reason"),
         [

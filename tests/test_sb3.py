@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
-from gymnasium.wrappers import DelayObservation, TransformObservation
+from gymnasium.wrappers import DelayObservation, NormalizeObservation, TransformObservation
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
@@ -168,6 +168,7 @@ class TestZips:
                 "differ",
             ),
             (lambda: TransformObservation(one(), abs, None), "can be imported and rec"),
+            (lambda: NormalizeObservation(one()), "in no wrapper that normalises by running"),
             (lambda: type("Local", (DelayObservation,), {})(one(), 2), "can be imported"),
         ],
     )
@@ -216,7 +217,7 @@ def test_spec_of_a_model_has_its_windows_and_wrappers():
         assert (parameters.delay, parameters.setpoint) == (3, "random")
     with pytest.raises(ValueError, match=r"windows .* of policy's training"):
         evaluate(model, spec_of(model, HARD, action_window=3))
-    with pytest.raises(ValueError, match="must be a model with its env"):
+    with pytest.raises(ValueError, match="model must have its environments"):
         spec_of(model.policy)
     # Plants may differ in a training.
     both = DummyVecEnv([one, lambda: gymnasium.make("MiddlePointNoisy-v0")])

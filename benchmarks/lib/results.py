@@ -61,8 +61,13 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
         raise UsageError(f"--out: {target} must not be the current folder or a folder above it")
     out_folder(final.parent)
     unfinished = final.with_name(f"{final.name}.unfinished")
-    _refuse_other_files(final)
-    with _lock(final):
+    try:
+        _refuse_other_files(final)
+        _refuse_other_files(_earlier(final))
+        lock = _lock(final)
+    except OSError as error:  # for example, a name that is too long
+        raise UsageError(f"--out: {target} cannot be used: {error.strerror}") from error
+    with lock:
         _prepare(unfinished, conditions)
         try:
             yield unfinished
@@ -120,10 +125,15 @@ def _record(folder: Path) -> dict[str, Any]:
     dict is empty if `RECORD_FILE` is missing or is not JSON.
     """
     try:
-        record: dict[str, Any] = json.loads((folder / RECORD_FILE).read_text(encoding="utf-8"))
+        record = json.loads((folder / RECORD_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return record
+    return record if isinstance(record, dict) else {}
+
+
+def _earlier(final: Path) -> Path:
+    """Return the folder to which `final` is moved for the moment in which it is replaced."""
+    return final.with_name(f".{final.name}.earlier")
 
 
 def _refuse_other_files(final: Path) -> None:
@@ -150,9 +160,11 @@ def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
     UsageError
         If the folder `unfinished` has files, but no valid `RECORD_FILE`.
     """
+    if unfinished.exists() and not unfinished.is_dir():
+        raise UsageError(f"--out: {unfinished} must be a folder: remove the file")
     record = _record(unfinished)
     has_files = bool(_files(unfinished))
-    if has_files and not record:
+    if has_files and not {"command", "conditions"} <= set(record):
         raise UsageError(f"--out: {unfinished} holds files that no run wrote: remove it")
     if conditions and record.get("conditions") == conditions:
         print(f"The run continues with the results in {unfinished}/", flush=True)
@@ -175,7 +187,8 @@ def _replace(final: Path, unfinished: Path) -> None:
     shutil.rmtree(unfinished / TASKS_FOLDER, ignore_errors=True)
     record = {**_record(unfinished), "files": _files(unfinished)}
     write_json(unfinished / RECORD_FILE, record)
-    earlier = final.with_name(f".{final.name}.earlier")
+    earlier = _earlier(final)
+    _refuse_other_files(earlier)
     shutil.rmtree(earlier, ignore_errors=True)
     if final.exists():
         final.rename(earlier)

@@ -63,6 +63,7 @@ class Log:
     temperature: Array  # the temperature at the time of each row, degC, shape (rows,)
     disturbances: Array  # measured disturbances, in any units, shape (rows, disturbances)
     sampling_interval: float  # the time between two rows, s
+    missing_flows: float = 0.0  # share of the rows whose flow was missing and was filled in
 
 
 class DeadZone(NamedTuple):

@@ -11,6 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.plant.checks import shorten
+from mptc_gym.presets import IDS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 from mptc_gym.wrappers.vector import IncrementalAction
 
@@ -31,7 +32,10 @@ def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
     ------
     ValueError
         If the environment `env` cannot be found, or if a value in `arguments` is out of range.
+        If `env` is the name of a preset, such as "hard", in place of the preset's id.
     """
+    if isinstance(env, str) and env in IDS:
+        raise ValueError(f"env must be an id: write {IDS[env]} for the preset {env}")
     try:
         return gymnasium.make(env, **{"disable_env_checker": True, **arguments})
     except (gymnasium.error.Error, ImportError) as error:

@@ -19,7 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 
-from mptc_gym.environments.layers import is_environment, layers, plant_groups
+from mptc_gym.environments.layers import is_environment, layers, normaliser_flag, plant_groups
 from mptc_gym.environments.making import make_batch, make_one
 from mptc_gym.evaluation import VALIDATION_SEED, WINDOWS, Evaluation, evaluate
 from mptc_gym.plant.checks import MOST_PLANTS, count, reject
@@ -81,7 +81,7 @@ def _spec_of_training(model: Any) -> EnvSpec:
         gymnasium.make(EnvSpec.from_json(spec.to_json()))
     except Exception as error:  # whatever a wrapper of another package raises
         raise ValueError(
-            "policy must be a model with its environments (mptc_gym.sb3.load returns one), "
+            "the model must have its environments (as a model from mptc_gym.sb3.load has), "
             "which must come from gymnasium.make or make_vec_env, in wrappers that can be "
             "imported and record their arguments, as gymnasium.utils.RecordConstructorArgs "
             "does, got "
@@ -108,7 +108,8 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     ValueError
         If the model's environments differ from each other or cannot be made from their spec. If
         the model's environments are in a `VecEnvWrapper`, such as `VecNormalize`, which a spec
-        cannot hold. If the zip cannot be written.
+        cannot hold, or in a wrapper that normalises by running statistics. If the zip cannot be
+        written.
     """
     path = _zip_path(path)
     spec = _spec_of_training(model)
@@ -116,9 +117,17 @@ def save(model: BaseAlgorithm, path: str | Path) -> None:
     different_specs = set(map(str, plants.get_attr("spec")))
     if isinstance(plants, VecEnvWrapper) or len(different_specs) > 1:
         raise ValueError(
-            "policy must have environments that do not differ, in no VecEnvWrapper, to be "
-            f"saved here, got {type(plants).__name__}: save the model by "
-            "model.save(path), and the statistics of a VecNormalize by "
+            "model must have environments that do not differ, in no VecEnvWrapper, to be "
+            f"saved here, got {type(plants).__name__}: save the model by model.save(path). If "
+            "the environments are in a VecNormalize, save its statistics by "
+            "model.get_vec_normalize_env().save(path)"
+        )
+    # A Gymnasium wrapper such as NormalizeObservation; a spec holds no statistics.
+    if any(map(normaliser_flag, layers(plants))):
+        raise ValueError(
+            "model must have environments in no wrapper that normalises by running statistics, "
+            "as a zip of mptc_gym.sb3.save does not hold the statistics: train in a "
+            "VecNormalize, and save the model by model.save(path) and the statistics by "
             "model.get_vec_normalize_env().save(path)"
         )
     algorithm = f"{type(model).__module__}:{type(model).__name__}"

@@ -102,6 +102,8 @@ class Copy:
             duplicate = self._copy_attributes(layer)
         else:
             duplicate = copy.deepcopy(layer, self._copies)
+        if duplicate is layer:
+            raise TypeError("its method __deepcopy__ returns the original")
         if isinstance(duplicate, VectorEnv):
             duplicate.closed = True  # as a vector environment closes itself when it is deleted
         return duplicate

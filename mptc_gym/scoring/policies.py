@@ -124,10 +124,11 @@ def _act_on_tensors(call: Callable[[Any], Any], module: Any) -> Act:
     """Return a function that converts NumPy arrays to tensors and calls a PyTorch module.
 
     The tensors have the type and the device of the module's weights. If the module has no
-    weights, the tensors are of float32 on the CPU.
+    weights of a floating-point type, the tensors are of float32 on the CPU.
     """
     torch: Any = sys.modules["torch"]  # not imported, as this package does not depend on it
-    weights = next(module.parameters(), torch.empty(0))
+    all_weights = (tensor for tensor in module.parameters() if tensor.is_floating_point())
+    weights = next(all_weights, torch.empty(0))
 
     def to_tensors(observations: Any) -> Any:
         """Return an array, or the arrays in a dict or a tuple, as tensors."""

@@ -42,7 +42,7 @@ def rollout(env: Any, act: Act, samples: int, seeds: list[int]) -> Iterator[Samp
         observations, infos = env.reset(seed=seeds)
     except RuntimeError as error:  # from a Monitor that does not allow early resets
         raise ValueError(f"env must allow a reset in mid-episode: {error}") from error
-    yield Sample(observations, infos_in_arrays(infos), np.zeros(len(seeds), np.bool_))
+    yield Sample(observations, _copied(infos_in_arrays(infos)), np.zeros(len(seeds), np.bool_))
     shape = (len(seeds), *env.single_action_space.shape)
     for _ in range(samples):
         actions = _checked_actions(act(observations), shape)
@@ -50,7 +50,7 @@ def rollout(env: Any, act: Act, samples: int, seeds: list[int]) -> Iterator[Samp
         arrays = infos_in_arrays(infos)
         # At the end of an episode, some environments return the infos of the next episode, and
         # put the infos of the last sample into "final_info".
-        infos_of_sample = arrays.get("final_info", arrays)
+        infos_of_sample = _copied(arrays.get("final_info", arrays))
         yield Sample(observations, infos_of_sample, terminated | truncated)
 
 
@@ -64,6 +64,14 @@ def infos_in_arrays(infos: Any) -> Infos:
         return infos
     names = [name for name, value in infos[0].items() if isinstance(value, int | float)]
     return {name: np.array([info.get(name, np.nan) for info in infos]) for name in names}
+
+
+def _copied(infos: Infos) -> Infos:
+    """Return infos as a new dict of new arrays, without the masks under names such as "_error".
+
+    A wrapper may write the infos of the next sample into the arrays of this sample.
+    """
+    return {name: np.array(infos[name]) for name in infos if not name.startswith("_")}
 
 
 def _checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
