@@ -137,8 +137,9 @@ class Observer:
         """
         bank = self._bank
         bank.observe(output)
-        # `responses` are mean outputs of the models with gain 1, newest first, shape (LAGS, n),
-        # and `fading` is the share of a deviation that remains after the delay, shape (n,).
+        # `responses` are mean outputs of the models with gain 1, newest first, shape (LAGS, n);
+        # the filter needs those of this sample and of the last. `fading` is the share of a
+        # deviation from the models that remains after the delay, shape (n,).
         self.filter.update(output, bank.responses[:2], bank.pole, bank.variance)
         forecast = self.filter.forecast(bank.pole, bank.fading)
         # At the first sample of an episode, there is no earlier set point to differ from.

@@ -1,4 +1,4 @@
-"""Compute a penalty for flows that use future set points, for the lower bound `causal`.
+"""Compute a penalty that makes the knowledge of future set points useless, for a lower bound.
 
 With the environment's argument `setpoint="random"`, the set point is piecewise constant. The
 *levels*, which are the values of the set point between changes, are independent and uniformly

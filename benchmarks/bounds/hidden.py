@@ -58,7 +58,9 @@ def bounds_with_hidden_load(model: LinearModel) -> ErrorBounds:
 
 
 def _with_load(model: LinearModel) -> tuple[Array, Array]:
-    """Return the matrices F(k) and Q(k) of the state equation of a plant with a normal load.
+    """Return the matrices F(k) and Q(k) of the state equation of a plant with its load.
+
+    The load is replaced by a normally distributed load with the same variances.
 
     The state equation is x(k) = F(k) x(k-1) + v(k), where x(k) is the state of
     `LinearModel.state_space_with_load`, and v(k) is white noise with the covariance matrix
@@ -79,6 +81,8 @@ def _with_load(model: LinearModel) -> tuple[Array, Array]:
     step_variance = level_variance - np.square(no_jump_probability) * previous_variance
     walk_variance = is_change * LOAD_INTERVAL * numbers.disturbance_walk_variance
     noise_variance = np.full(len(k), numbers.noise_variance)
+    # Variances of the three inputs of the state equation: the white noise of the plant, the
+    # jumps of the load and the steps of the load's random walk.
     variances = np.stack([noise_variance, step_variance, walk_variance], axis=1)
     F, E = model.state_space_with_load(no_jump_probability)
     return F, np.einsum("kv,kiv,kjv->kij", variances, E, E)

@@ -265,9 +265,10 @@ def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
 def misfits_of(
     controllers: Mapping[str, ControllerSpec], plants: Sequence[Parameters]
 ) -> dict[str, str]:
-    """Return a sentence for each controller that does not fit all plants, by controller name.
+    """Return why a controller was made for another plant than one of `plants`, by its name.
 
-    The sentence gives the reason for the first plant that the controller does not fit.
+    Controllers that fit all plants are left out. If a controller does not fit several plants,
+    the sentence gives the reason for the first of these plants.
     """
     misfits: dict[str, str] = {}
     for name, controller in controllers.items():

@@ -121,8 +121,8 @@ class GroupBuffer(RolloutBuffer):
 class Exploration(BaseCallback):
     """A callback that lowers the standard deviation of the actions during the training.
 
-    The natural logarithm of the standard deviation changes linearly with the number of samples
-    of experience.
+    The natural logarithm of the standard deviation of the actions changes linearly with the
+    number of training steps so far.
 
     Parameters
     ----------

@@ -269,10 +269,9 @@ class Fit:
         return float(self.errors @ self.errors + TINY)
 
     def improvement(self, squares: Array | float) -> Array:
-        """Return by how much other fits to the log are better than this fit; negative if worse.
+        """Return twice the log-likelihood ratio of other fits to this fit: above 0 if better.
 
-        The result is twice the logarithm of a ratio: the likelihood of another fit divided by
-        the likelihood of this fit. `squares` has the sums of squared prediction errors of the
+        `squares` has the sums of squared prediction errors of the
         other fits, degC^2, and the result has the shape of `squares`.
         """
         return np.asarray(len(self.errors) * np.log(self.squares / (squares + TINY)))

@@ -117,6 +117,7 @@ class Net(nn.Module):
             "output_weights": self.output.weight,
             "output_biases": self.output.bias,
         }
+        # `RecurrentNetwork` copies the arrays.
         arrays = {name: tensor.detach().numpy() for name, tensor in tensors.items()}
         return RecurrentNetwork(**arrays, provenance=provenance)
 

@@ -1,4 +1,4 @@
-"""Copy wrapped environments, so that a policy can act in a copy.
+"""Copy wrapped environments, so that a policy can act without changing the originals.
 
 The name `layer` stands for one object of a wrapped environment: a wrapper, a vector environment
 or the innermost environment. `copy.deepcopy` alone is not enough: `deepcopy` fails for open

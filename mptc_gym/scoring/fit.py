@@ -33,12 +33,18 @@ _MODELS: Final = (
 
 
 def check_fit(policy: Any, plants: Plants) -> None:
-    """Raise a ValueError if a policy cannot be scored in the vector environment `plants`."""
+    """Raise a ValueError if a policy cannot be scored in the vector environment `plants`.
+
+    The reason is one of four: a worker process of `plants` has a wrapper that normalises; a
+    wrapper has untrained statistics; the policy's method `check_environment` refuses the
+    plants; or the policy is a model of Stable-Baselines3 that was trained with other spaces,
+    observation windows or wrappers.
+    """
     for layer in layers(plants):
         if runs_processes(layer):
-            _check_processes(layer)
+            _refuse_normalisers_in_processes(layer)
         elif normaliser_flag(layer):
-            _check_statistics(layer)
+            _refuse_untrained_statistics(layer)
     target = form_of(policy).target
     if hasattr(target, "check_environment"):
         groups = plant_groups(plants)
@@ -50,7 +56,7 @@ def check_fit(policy: Any, plants: Plants) -> None:
         _check_training(target, plants)
 
 
-def _check_processes(vector_env: Any) -> None:
+def _refuse_normalisers_in_processes(vector_env: Any) -> None:
     """Raise a ValueError if a worker process of `vector_env` has a wrapper that normalises."""
     if any(ask_processes(vector_env, "has_wrapper_attr", "update_running_mean")):
         raise ValueError(
@@ -59,7 +65,7 @@ def _check_processes(vector_env: Any) -> None:
         )
 
 
-def _check_statistics(normaliser: Any) -> None:
+def _refuse_untrained_statistics(normaliser: Any) -> None:
     """Raise a ValueError if a wrapper normalises observations by untrained statistics."""
     # A wrapper that normalises only rewards has no attribute `obs_rms`.
     statistics = vars(normaliser).get("obs_rms", {})
@@ -77,8 +83,8 @@ def _check_statistics(normaliser: Any) -> None:
 def _check_training(model: Any, plants: Plants) -> None:
     """Raise a ValueError if plants differ from the plants of a model's training.
 
-    Observation windows and wrappers are compared only if the model still has the training
-    environments.
+    The observation windows and wrappers of the plants are compared with those of the training
+    only if the model still has its training environments.
     """
     training = getattr(model, "env", None)
     # The list is empty if the training environments ran in processes that are now closed.
