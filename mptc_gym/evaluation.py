@@ -100,15 +100,17 @@ class Evaluation:
     def __repr__(self) -> str:
         mean_error = f"{self.env}: mean error {self.mean_error:.3f} degC"
         score = ""
+        # Equal episodes may differ by rounding errors.
+        are_alike = bool(np.ptp(self.errors) < 1e-6)
         if self.interval is not None:
             mean_error += f", {self.multiple:.2f} times the least possible"
             score = f"score {self.score:.3f}"
             low, high = self.interval
-            if low < high:
+            if not are_alike:
                 score += f" (95 % {low:.3f} to {high:.3f})"
         travel = f"valve travel {self.travel:.0f} t/h"
         episodes = f"{len(self.errors)} episodes"
-        if np.ptp(self.errors) == 0.0:
+        if are_alike:
             episodes += ", all alike"
         parts = [mean_error, score, travel, episodes, self.note]
         return "; ".join(part for part in parts if part)
@@ -204,7 +206,7 @@ valve travel 10 t/h; 100 episodes, all alike
     >>> mptc_gym.evaluate(model, spec_of(model, "MiddlePointHard-v0"))
     """
     episodes = count("episodes", episodes, 2, MOST_PLANTS)
-    first = count("seed", seed, 0, 2**63)
+    first = count("seed", seed, 0, 2**63 - 1)
     seeds = range(first, first + episodes)
     with opened(env, episodes, policy, **arguments) as plants:
         check_fit(policy, plants)

@@ -112,6 +112,9 @@ class TestEvaluate:
         assert "\n" not in str(result)
         same = str(evaluate(idle, episodes=2))  # an interval of no width would mean nothing
         assert "score 0.000; valve travel 0 t/h; 2 episodes, all alike" in same
+        rounded = str(dataclasses.replace(result, errors=np.array([5.0, 5.0 + 1e-12])))
+        assert "all alike" in rounded
+        assert "(95 %" not in rounded
 
 
 class TestBounds:

@@ -122,6 +122,8 @@ class TestBatches:
             "seed must be an integer from 0": {"seed": "a"},
             "env must be of this pack": {"env": DelayObservation(one(), delay=2).spec},
             "max_move must be": {"wrapper": {"max_move": 7}},
+            "wrapper must be arguments of Incr": {"wrapper": {"maxmove": 1.0}},
+            "wrapper must be IncrementalAction, or": {"wrapper": "IncrementalAction"},
             "env must be the id of an environment": {"env": "Point-v0"},
         }.items():
             with pytest.raises(ValueError, match=message):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn, cast
 
@@ -260,13 +261,18 @@ def make_vec_env(
     n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
     group = count("group", group, 1, n_envs)
     if seed is not None:
-        seed = count("seed", seed, 0, 2**63)
+        seed = count("seed", seed, 0, 2**63 - 1)
     render_mode = arguments.pop("render_mode", None)  # for the batch, but not for its spec
     single = make_one(env, arguments)
     if isinstance(wrapper, Mapping):
+        unknown = set(wrapper) - set(inspect.signature(IncrementalAction).parameters)
+        if unknown:
+            reject("wrapper", wrapper, "arguments of IncrementalAction")
         single = IncrementalAction(single, **wrapper)
-    elif wrapper is not None:
+    elif callable(wrapper):
         single = wrapper(single)
+    elif wrapper is not None:
+        reject("wrapper", wrapper, "IncrementalAction, or a dict of its arguments")
     batch = make_batch(
         single, n_envs, autoreset_mode=AutoresetMode.SAME_STEP, render_mode=render_mode
     )
