@@ -59,7 +59,7 @@ class HasJsonSpec:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The `EnvSpec` from which `gymnasium.make` can make an environment like this one."""
+        """The `EnvSpec` of an environment like this one, for `gymnasium.make`, or None."""
         return self._spec
 
     @spec.setter
@@ -157,10 +157,11 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
 
     The default observation holds three set points and three errors, the six inputs of the
     paper's neural network. Past actions in the observation are clipped to +-1, because the
-    actuator limits the flow that an action beyond +-1 commands. With `action_window=delay+2`
-    and without noise, the control problem is a Markov decision process as long as the set point
-    stays constant. If the set point can exceed +-`temperature_span`, the bounds of set points
-    and errors in the observation space are wide enough to include the set point.
+    actuator limits the flow that an action beyond +-1 commands. With `action_window=delay+2`,
+    otherwise default windows and polynomials, a constant set point, and without noise, load,
+    drifts and ranges, the control problem is a Markov decision process. If the set point can
+    exceed +-`temperature_span`, the bounds of set points and errors in the observation space
+    are wide enough to include the set point.
 
     ## Reward
 
@@ -172,8 +173,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     If `move_weight` is 0, the reward "quadratic" is the negative of the cost in equation (12)
     of the paper, applied to the error divided by `error_scale`. The best possible reward of a
     step is 0. With the default arguments and a constant feedwater flow of 0 t/h, the reward of
-    every step is -0.5. The reward has no lower bound, because the error in the reward is the
-    set point minus the true temperature, which the transmitter's range does not limit.
+    every step is -0.5. The transmitter's range does not limit the reward, because the error in
+    the reward is the set point minus the true temperature.
 
     ## Starting state
 
@@ -234,7 +235,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     For an invalid argument or `render_mode`, the constructor raises a `ValueError` that names
     the argument. For an unknown argument, the constructor raises a `TypeError`. If an action is
     not one finite number, `step` raises a `ValueError` and leaves the plant unchanged. Without
-    pygame, the first call of `render` raises `DependencyNotInstalled`.
+    pygame, `render` raises `DependencyNotInstalled` in an environment with a render mode.
 
     ## Version history
 
@@ -432,9 +433,10 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         Raises
         ------
         ResetNeeded
-            If `render` is called before the first `reset`.
+            If the environment has a render mode, and `render` is called before the first
+            `reset`.
         DependencyNotInstalled
-            If pygame is not installed.
+            If the environment has a render mode, and pygame is not installed.
         """
         if self.render_mode is None:
             logger.warn(NO_RENDER_MODE)

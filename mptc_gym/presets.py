@@ -48,4 +48,4 @@ each reset. "hard" combines the disturbances, drifts and random plants with rand
 IDS: Final[dict[str, str]] = {
     name: f"MiddlePoint{name.title().replace('-', '')}-v0" for name in PRESETS
 } | {"paper": "MiddlePoint-v0"}
-"""The id of each preset, as in `gymnasium.make(IDS["noisy"])`, with or without arguments."""
+"""The id of each preset, by name of the preset, as in `gymnasium.make(IDS["noisy"])`."""

@@ -72,13 +72,13 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     float32.
 
     A step uses array arithmetic only, except when each plant draws random numbers from a
-    separate generator: at the start of an episode, about every 600 samples of noise, and when a
-    random set point changes. The memory for one plant is a few KiB, and does not grow with the
-    length of an episode.
+    separate generator: at the start of an episode, about every 600 samples of noise or load
+    (more often for the noise of more than 28,000 plants), and when a random set point changes.
+    The memory for one plant is a few KiB, and does not grow with the length of an episode.
 
-    With an unstable polynomial `a`, or with actions beyond +-1e154, the temperature may
-    overflow. NumPy warns of an overflow in `MiddlePointVectorEnv`; `MiddlePointEnv` gives no
-    warning.
+    With an unstable polynomial `a`, the temperature may overflow. With actions beyond +-1e154,
+    squared actions and commanded flows may overflow, but the actuator limits the applied flow.
+    NumPy warns of an overflow in `MiddlePointVectorEnv`; `MiddlePointEnv` gives no warning.
     """
 
     metadata: dict[str, Any] = MiddlePointEnv.metadata | {"render_modes": ["rgb_array"]}
@@ -103,8 +103,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._records: dict[int, Record] = {}
         self._seeds: list[int | None] = [None] * num_envs
         self._plant_sampler = PlantSampler(parameters)
-        # Blocks of noise end with an episode, so that no noise is generated in vain. Where many
-        # plants would need much memory, the blocks are shorter, which is slower.
+        # The blocks of noise of an episode end at or shortly after the end of the episode, so
+        # that little noise is generated in vain. Where many plants would need much memory, the
+        # blocks are shorter, which is slower.
         most_samples = max(1, min(SAMPLES_AT_A_TIME, NOISE_BYTES // (8 * num_envs)))
         blocks_per_episode = math.ceil(self._episode_length / most_samples)
         block = math.ceil(self._episode_length / blocks_per_episode)
@@ -135,9 +136,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         Raises
         ------
         ResetNeeded
-            If `render` is called before the first `reset`.
+            If the environment has a render mode, and `render` is called before the first
+            `reset`.
         DependencyNotInstalled
-            If pygame is not installed.
+            If the environment has a render mode, and pygame is not installed.
         """
         if self.render_mode is None:
             logger.warn(NO_RENDER_MODE)
@@ -218,7 +220,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         """Return the transmitter's readings of the temperatures `output`, degC, shape (n,).
 
         A reading is the temperature plus measurement noise, limited to +-`temperature_span`.
-        Without measurement noise and saturation, the method returns the array `output` itself.
+        Without measurement noise and saturation, the returned array may be `output` itself.
         """
         reading = output
         if self._signals.measurement_noise is not None:

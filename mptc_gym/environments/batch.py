@@ -93,8 +93,8 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         if self.parameters.drifts:
             self._info_names += FACTORS
         self._was_reset = False
-        # Steps of the environment so far. The sample k of a plant is the clock minus the start
-        # of the plant's episode.
+        # Steps of the environment so far, without the steps that reset all plants. The sample
+        # k of a plant is the clock minus the start of the plant's episode.
         self._clock = 0
         self._starts = np.zeros(num_envs, np.int64)  # the clock at k = 0 of each plant
         self._next_end = 0  # the clock when an episode ends next

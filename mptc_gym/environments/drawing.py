@@ -280,7 +280,7 @@ def hide(viewer: object) -> None:
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return 3 to 7 tick values for an axis from `low` to `high`.
+    """Return 2 to 7 tick values for an axis from `low` to `high`.
 
     The tick values are multiples of a step, which is 1, 2 or 5 times a power of ten.
     """

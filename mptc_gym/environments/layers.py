@@ -22,7 +22,7 @@ VEC_ENV: Final = "stable_baselines3.common.vec_env"
 # this package holds inner environments.
 INNER: Final = ("venv", "env", "envs", "batches")
 # Class names of layers that may differ between a policy's training and an evaluation: these
-# layers leave actions as they are, and leave observations as they are or add noise.
+# layers leave actions as they are, and leave observations that are not pictures as they are.
 _NEUTRAL: Final = frozenset({
     "MiddlePointEnv",
     "AsyncVectorEnv", "DummyVecEnv", "GymnasiumVecEnv", "SubprocVecEnv", "SyncVectorEnv",
@@ -157,8 +157,8 @@ def _groups_in_processes(env: Any, outer: tuple[str, ...]) -> list[PlantGroup]:
     """Return descriptions of the plants in the worker processes of a vector environment.
 
     `outer` holds the class names of the wrappers around `env`, the outermost first. The
-    returned list is empty if the worker processes are closed, or if an environment is from
-    another package.
+    returned list is empty if the worker processes are closed, or if an environment has no
+    attribute `parameters`, as is usual for environments of other packages.
     """
     try:
         texts = ask_processes(env, "__str__")

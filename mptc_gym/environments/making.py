@@ -31,8 +31,8 @@ def make_one(env: str | EnvSpec, arguments: Mapping[str, Any]) -> Env:
     Raises
     ------
     ValueError
-        If the environment `env` cannot be found, or if a value in `arguments` is out of range.
-        If `env` is the name of a preset, such as "hard", in place of the preset's id.
+        If the environment `env` cannot be found, if a value in `arguments` is out of range, or
+        if `env` is the name of a preset, such as "hard", in place of the preset's id.
     """
     if isinstance(env, str) and env in IDS:
         raise ValueError(f"env must be an id: write {IDS[env]} for the preset {env}")
@@ -61,8 +61,9 @@ def make_batch(single: Env, n: int, **modes: Any) -> Any:
     -------
     VectorEnv or None
         A `MiddlePointVectorEnv` with n plants, with the arguments and the wrappers of `single`.
-        None if `single` is not a `MiddlePointEnv`, or if `single` has a wrapper other than
-        `IncrementalAction` and the wrappers of `gymnasium.make`.
+        None if `single` has no `EnvSpec`, if the innermost environment of `single` is not a
+        `MiddlePointEnv`, or if `single` has a wrapper other than `IncrementalAction` and the
+        wrappers of `gymnasium.make`.
     """
     spec = single.spec
     plant = single.unwrapped

@@ -41,7 +41,8 @@ def reject(name: str, value: object, allowed: str) -> NoReturn:
 def shorten(value: object) -> str:
     """Return the repr of a value for an error message, cut to the first 80 characters.
 
-    If the repr is cut, the result ends with the length of a list or the shape of an array.
+    A text that is cut ends with "..." and, for a list, a tuple or an array, with the number of
+    elements or the shape.
     """
     text = repr(value)
     length = ""
@@ -61,7 +62,7 @@ def one_action(action: Any) -> float:
     Parameters
     ----------
     action
-        Normalised action: a number, or an array or a tensor with one element.
+        Normalised action: a number, or an array, a list or a tensor with one element.
 
     Raises
     ------

@@ -189,9 +189,10 @@ class Dynamics:
             Gain factor divided by time constant factor, g / t, by which the polynomial B is
             multiplied.
         load_gain : float or array
-            Factor of the load disturbance w(k) in equation (28): the sum of the coefficients of
-            the polynomial A for the given time constant, so that a constant load w adds w to
-            the steady-state temperature.
+            Factor of the load disturbance w(k), which is not in the paper and is added to the
+            right side of equation (28): the sum of the coefficients of the polynomial A for the
+            given time constant, so that a constant load w adds w to the steady-state
+            temperature.
         """
         alpha: list[Any] = self._negated_a
         if self._quotient:
@@ -222,8 +223,8 @@ class Plant:
     ----------
     factors : dict of float
         Values of "gain_factor" and "time_constant_factor" at the present sample, as multiples
-        of the gain and of the time constant of the polynomials A and B. `factors` is empty if
-        neither gain nor time constant drifts.
+        of the gain and of the time constant of the polynomials `a` and `b` in `parameters`.
+        `factors` is empty if neither gain nor time constant drifts.
     """
 
     def __init__(self, parameters: Parameters, numbers: PlantNumbers[float]) -> None:
@@ -324,8 +325,8 @@ class PlantBatch:
         for the arguments that are ranges, and of shape () for all other arguments.
     factors : dict of ndarray of float64
         Values of "gain_factor" and "time_constant_factor" at the present sample, shape (n,), as
-        multiples of the gain and of the time constant of the polynomials A and B. `factors` is
-        empty if neither gain nor time constant drifts.
+        multiples of the gain and of the time constant of the polynomials `a` and `b` in
+        `parameters`. `factors` is empty if neither gain nor time constant drifts.
     """
 
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
@@ -497,7 +498,7 @@ class _InputResponse:
             self._delayed_indices[:, plants] = rows * self._num_envs + plants
 
     def add(self, applied: Values) -> Values:
-        """Store the applied flows u_a(k), and return the response to all past flows, degC.
+        """Store the applied flows u_a(k), and return the response to all flows so far, degC.
 
         `applied` holds the flows u_a(k) of the plants in t/h, shape (n,). The returned
         response, shape (n,), is the part B(z^-1) u_a(k+1-d) of the temperatures y(k+1), with

@@ -265,17 +265,19 @@ class Parameters(PlantNumbers[Number]):
         return cls(**arguments)
 
     def _check_actuator(self) -> None:
-        """Raise a ValueError if a reset could sample a dead zone that no flow command can pass.
+        """Raise a ValueError if a reset could sample limits or a dead zone that do not fit.
 
         For all values that a reset may sample from ranges, `u_min` must be below `u_max`, and
-        `dead_zone` must not exceed max(|u_min|, |u_max|).
+        `dead_zone` must not exceed max(|u_min|, |u_max|), so that some flow command from
+        `u_min` to `u_max` can pass the dead zone.
         """
         lowest_u_min, highest_u_min = self.range_of("u_min")
         lowest_u_max, highest_u_max = self.range_of("u_max")
         if highest_u_min >= lowest_u_max:
             reject("u_min", self.u_min, f"below u_max = {self.u_max}")
-        # The smallest value of max(|u_min|, |u_max|), the largest magnitude of a flow command.
-        # In a range [low, high], the smallest magnitude is max(low, -high, 0).
+        # The largest magnitude of a flow from u_min to u_max is max(|u_min|, |u_max|), of which
+        # a reset can sample the following smallest value. In a range [low, high], the smallest
+        # magnitude is max(low, -high, 0).
         largest_command = max(lowest_u_min, -highest_u_min, lowest_u_max, -highest_u_max, 0.0)
         _, largest_dead_zone = self.range_of("dead_zone")
         if largest_dead_zone > largest_command:

@@ -134,7 +134,7 @@ class PlantSampler:
         self._lowest: PlantNumbers[Values] = PlantNumbers(**lowest)
 
     def sample(self, streams: Sequence[RandomStreams]) -> PlantNumbers[Values]:
-        """Begin the next episode of n plants, and return the parameter values of these plants.
+        """Return the parameter values of n plants for the next episode of these plants.
 
         Parameters
         ----------

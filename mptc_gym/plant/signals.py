@@ -5,8 +5,9 @@ some plants at sample k = 0. `next` returns the values of a signal at the next s
 per plant. In an environment with one plant, `ahead` returns the values of a signal at the next
 600 samples (`SAMPLES_AT_A_TIME`), which is faster than 600 calls of `next`.
 
-Signals draw many random numbers at a time, because one call of a random number generator is
-much faster than many calls and returns the same random numbers.
+Noise and load disturbance draw many random numbers at a time, because one call of a random
+number generator is much faster than many calls and returns the same random numbers. A random
+set point, which changes rarely, draws random numbers for one level at a time.
 
 Formulas use the symbols of the paper: set point y_d(k), temperature y(k), and coloured noise
 n(k) = C(z^-1) xi(k) with white noise xi. The load disturbance w(k) is not in the paper.
@@ -153,7 +154,8 @@ class SetPointLevels:
     random : bool
         Whether the levels of the set point and their durations are random.
     amplitude : float
-        Largest magnitude of a random level of the set point, degC.
+        Magnitude of the levels of a square set point, or largest magnitude of a random level
+        of the set point, degC.
     shortest, longest : int
         Shortest and longest duration of a random level of the set point, samples.
     values, lengths : list
@@ -199,8 +201,9 @@ class _HeldSignal(ABC):
     Attributes
     ----------
     present : ndarray of float64
-        Value of the signal of each plant at the present sample, degC, shape (num_envs,). Other
-        objects must not modify the array `present`.
+        Value of the signal of each plant, degC, shape (num_envs,), at the latest sample for
+        which `reset` or `next` returned the signal. After a call of `ahead`, `present` has no
+        meaning for other objects. Other objects must not modify the array `present`.
     """
 
     def __init__(self, num_envs: int) -> None:
@@ -230,7 +233,7 @@ class _HeldSignal(ABC):
 
 
 class SetPoint(_HeldSignal):
-    """The set point y_d(k) of many plants, in degC.
+    """The set point y_d(k) of n plants, in degC.
 
     Parameters
     ----------
@@ -245,7 +248,8 @@ class SetPoint(_HeldSignal):
         self._levels = SetPointLevels(parameters)
         self._level_values = np.array(self._levels.values)
         self._level_lengths = np.array(self._levels.lengths)
-        # Index of each plant's next level in the two arrays, unless levels are random.
+        # Index of each plant's next level in `_level_values` and in `_level_lengths`; unused if
+        # levels are random.
         self._places = np.zeros(num_envs, np.intp)
 
     def reset(self, plants: Indices, streams: StreamsOfPlants) -> Values:
@@ -413,7 +417,7 @@ class Disturbance(_HeldSignal):
 
 
 class Signals(NamedTuple):
-    """The external signals of n plants; a field is None if the signal is always 0."""
+    """The external signals of n plants; a noise or load that is always 0 is None."""
 
     setpoint: SetPoint
     noise: Noise | None
@@ -465,7 +469,7 @@ class Signals(NamedTuple):
         """Return all signals of a single plant at the next 600 samples, one tuple per sample.
 
         Each tuple holds set point y_d, noise n, load w and measurement noise at a sample, in
-        degC.
+        degC. `ahead` needs signals that were made with the default `block` of 600 samples.
         """
         columns: list[list[float]] = []
         for signal in self:

@@ -61,7 +61,7 @@ def plant_state(
 
 
 def _nominal_gain(parameters: Parameters) -> float:
-    """Return the steady-state gain of the polynomials `a` and `b`, degC per t/h, or inf."""
+    """Return the steady-state gain of `a` and `b`, degC per t/h; inf if `a` sums to 0."""
     denominator = sum(parameters.a)
     return sum(parameters.b) / denominator if denominator else math.inf
 

@@ -28,14 +28,13 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
 
     In process control, changing the flow at each step is called the velocity form. The wrapper
     stores a wanted flow v, t/h, which is the flow that the policy asks for, and 0 after
-    `reset`. An action w, from -1 to 1, changes v, the flow in t/h that the policy asks for::
+    `reset`. An action w, from -1 to 1, changes v::
 
         v(k) = v(k-1) + w(k) max_move (u_max - u_min) / 2,   limited to [u_min, u_max]
 
     The actuator's limits are u_min and u_max, t/h. Without compensation of the dead zone, the
-    commanded flow is u(k) = v(k), the flow that the policy asks for. Changing the flow, instead
-    of setting the flow, wears the valve less and makes exploration effective, because every
-    change of the flow lasts.
+    commanded flow is u(k) = v(k). Changing the flow, instead of setting the flow, wears the
+    valve less and makes exploration effective, because every change of the flow lasts.
 
     With `compensate_dead_zone`, the commanded flow u skips the dead zone, whose half width is
     z, t/h::
@@ -44,17 +43,18 @@ class IncrementalAction(gymnasium.ActionWrapper[Any, Any, Any], RecordConstructo
         v = 0:   u =  0
         v < 0:   u = -z + (u_min + z) v / u_min
 
-    With compensation of the dead zone, every change of the wanted flow v changes the applied
-    flow, and some v leads to every flow that the actuator can apply. The commanded flow is 0
-    from `reset` until the first nonzero action.
+    If z is the half width of the plant's own dead zone, u_min is below -z and u_max is above z,
+    every change of the wanted flow v changes the applied flow, and each flow that the actuator
+    can apply results from some v. If u_min is at most 0 and u_max at least 0, the wanted flow
+    is 0 from `reset` until the first nonzero action.
 
     The action space is `Box(-1, 1, (1,), float32)`; actions beyond +-1 are clipped. The wrapped
     environment receives an action that sets the flow, and computes observation, reward (with
     `move_weight`) and info from that action. A policy must know the wanted flow v, which
     follows from the newest past action in the observation, so the environment needs an
-    `action_window` of at least 1. With the default delay of 18 samples, without noise and with
-    a constant set point, `action_window=20` makes the control problem a Markov decision
-    process.
+    `action_window` of at least 1. With a constant set point and otherwise default arguments,
+    such as a delay of 18 samples and no noise, `action_window=20` makes the control problem a
+    Markov decision process.
 
     Parameters
     ----------
