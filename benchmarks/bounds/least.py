@@ -80,6 +80,7 @@ class LeastPossible(Estimate):
         -------
         ndarray
             Scores, in the shape of `errors`. The score of a single run may exceed 1 by chance.
+            If `kind` is "reference", the scores of a controller with foresight may exceed 1.
 
         Raises
         ------
