@@ -21,10 +21,11 @@ choice of the price gives a lower bound that is far below the error of real cont
 module chooses the price pi(j) = sum_k G[k, j] (g(k) - E[g(k) | set points up to j]), where
 G[k, j] is the effect of a flow of 1 t/h at sample j on the output y(k), degC, and the *slope*
 g(k), a number from -1 to 1, estimates roughly how fast the mean error E|e(k)| rises with the
-expected error E[e(k)]. From a change of the set point until the output can have reached the new
-level, the slope g(k) of the mean error is the sign of the change. After the output can have
-reached the new level of the set point, the slope g(k) of the mean error is such that an
-additional flow would not change the sum of the mean errors from its first effect on.
+expected error E[e(k)]. From a change of the set point until the output can have reached every
+new level, the slope g(k) of the mean error is the sign of the change times the probability that
+the error is larger than the noise. Later, the slope g(k) of the mean error is such that an
+additional flow would change the sum of the mean errors from its first effect on as little as
+possible.
 """
 
 import numpy as np
@@ -40,9 +41,11 @@ Array = NDArray[np.float64]
 
 # Number of equally probable magnitudes of the noise from which the slope g is computed.
 NOISE_MAGNITUDES = 8
-# Steady-state gain, degC per t/h, that replaces the infinite gain of an integrating plant.
+# Largest steady-state gain, degC per t/h, in place of an integrating plant's infinite gain.
 LARGEST_GAIN = 1e9
-SMALLEST_RANGE = 1e-9  # degC; a divisor in place of 0, if all set points and flows are 0
+# Least divisor, degC. Without it, a divisor could be 0 or negative if the limits of the flow
+# exclude 0 t/h.
+SMALLEST_RANGE = 1e-9
 # Share of the way to the farthest steady temperature that an output has made after four time
 # constants. An output that cannot reach a level counts as having arrived after this share.
 ARRIVED = 1.0 - np.exp(-4.0)
@@ -78,6 +81,7 @@ class SetPointLaw:
         self._shortest = levels.shortest
         self._longest = levels.longest
         # A constant flow can keep every temperature from -reachable to reachable, degC.
+        # `_reachable` is negative if the limits exclude a flow of 0 t/h.
         low, high = model.limits
         gain = min(float(np.abs(at_start.gain)), LARGEST_GAIN)
         self._reachable = gain * min(-low, high)
@@ -93,8 +97,8 @@ class SetPointLaw:
         # `_progress` is the share of the way to this temperature, by the age of the level.
         age = np.arange(samples)
         self._progress = 1.0 - at_start.slowest_pole ** np.maximum(age - model.lag + 1, 0)
-        # Age of a level at which the output has arrived at the level after every change of the
-        # set point. The largest change is from -amplitude to amplitude.
+        # Age of a level at which the output counts as having arrived at the level, after every
+        # change of the set point. The largest change is from -amplitude to amplitude.
         largest_way = max(self._reachable + self._amplitude, SMALLEST_RANGE)
         largest_share = 2.0 * self._amplitude / largest_way
         self._arrival_age = int(np.searchsorted(self._progress, min(largest_share, ARRIVED)))
@@ -161,8 +165,8 @@ class SetPointLaw:
         """Return the slopes dE|e|/dE[e] after a change of the set point, shape (samples,).
 
         The set point changes from `previous_level` to `level`, degC. The slope is the sign of
-        the change times the probability that the error is larger than the noise, and 0 once the
-        output can have reached the new level.
+        the change times the probability that the error is larger than the noise, and 0 from the
+        age on at which the output counts as having arrived after every change.
         """
         change = level - previous_level
         way = max(self._reachable - np.sign(change) * previous_level, 0.0)
@@ -181,8 +185,8 @@ class SetPointLaw:
         progress = self._progress[:, np.newaxis]
         way_up = max(self._reachable - level, 0.0)
         way_down = max(self._reachable + level, 0.0)
-        # New levels that the output has not reached yet form an interval above the temperature
-        # of the output and an interval below it. The lengths of the two intervals are, in degC:
+        # New levels from which the output is still farther away than the noise form two
+        # intervals: one ends at A, the other at -A. The lengths of the intervals, degC, are:
         above = np.maximum(A - level - way_up * progress - self._noise_magnitudes, 0.0)
         below = np.maximum(A + level - way_down * progress - self._noise_magnitudes, 0.0)
         mean: Array = (above - below).mean(axis=1) / (2.0 * A)

@@ -1,10 +1,11 @@
 """Estimate the least possible error of controllers that cannot measure the load.
 
 A lower bound that `least.py` computes for the error at sample k holds for controllers that know
-the load up to the sample k - d - 1, where d is the plant's delay in samples. A real controller
-has only the transmitter's readings, in which noise hides the load. No lower bound is known for
-controllers that have only readings, so this module estimates the least possible error of these
-controllers. Reports show the estimate in the column "hidden load".
+the load up to the sample k - d - 1. Here, d + 1 is `LinearModel.lag`, the number of samples
+from a flow to its first effect on the output. A real controller has only the transmitter's
+readings, in which noise hides the load. No lower bound is known for controllers that have only
+readings, so this module estimates the least possible error of these controllers. The command
+`python -m benchmarks.bounds` prints the estimate in the column "hidden load (estimate)".
 
 The estimate for a hidden load is the least possible error with a known load, plus the increase
 of the least possible error from a known load to a hidden load. The increase of the least
@@ -36,7 +37,7 @@ def bounds_with_known_load(model: LinearModel) -> ErrorBounds:
     """Return lower bounds of the mean errors of a controller that knows the past load.
 
     The lower bound at sample k holds if the controller knows the load up to sample k - d - 1,
-    where d is the plant's delay in samples, and if the load is normally distributed. `model` is
+    where d + 1 is `model.lag`, and if the load is normally distributed. `model` is
     the plant at the samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)
@@ -49,7 +50,7 @@ def bounds_with_hidden_load(model: LinearModel) -> ErrorBounds:
     """Return lower bounds of the mean errors if only the transmitter's readings are known.
 
     The lower bound at sample k holds if the controller knows the readings up to sample
-    k - d - 1, where d is the plant's delay in samples, and if the load is normally distributed.
+    k - d - 1, where d + 1 is `model.lag`, and if the load is normally distributed.
     `model` is the plant at the samples k = 0, 1, ... of an episode.
     """
     F, Q = _with_load(model)

@@ -5,9 +5,10 @@ the set point minus the output, degC. The file README.md in this folder says for
 controllers each kind of least possible error holds.
 
 At sample k, a controller may know the plant's parameters, and the transmitter's readings, the
-set points and the loads up to k. No controller knows the true output, `info["output"]`, or the
-time at which the load jumps next. A controller may compensate for the dead zone of the
-actuator.
+set points and the loads up to k. For the kind "preview", a controller may also know all later
+set points. If the transmitter has noise, no controller knows the true output, `info["output"]`.
+No controller knows the time at which the load jumps next. A controller may compensate for the
+dead zone of the actuator.
 """
 
 from collections.abc import Callable, Sequence
@@ -79,6 +80,7 @@ class LeastPossible(Estimate):
         -------
         ndarray
             Scores, in the shape of `errors`. The score of a single run may exceed 1 by chance.
+            If `kind` is "reference", the scores of a controller with foresight may exceed 1.
 
         Raises
         ------
@@ -163,7 +165,7 @@ def with_hidden_load(
 
     The estimate for a hidden load, which `hidden.py` derives, is not a lower bound. If the
     plant has no load, the least possible error is returned. The parameters and exceptions are
-    those of `least_possible`.
+    those of `least_possible` without the parameter `kind`.
     """
     least = least_possible(samples=samples, episodes=episodes, seed=seed, **arguments)
     parameters = Parameters(**arguments)
@@ -249,7 +251,7 @@ def _error_sum(
     at each sample for a model of the plant.
     """
     length = len(setpoint)
-    if kind == "reference":  # A reference plans beyond the end of the episode.
+    if kind == "reference":  # A reference can plan beyond the end.
         length += int(numbers.delay) + len(parameters.b) + LOOKAHEAD
     model = LinearModel(parameters, numbers, np.arange(length))
     bounds = bounds_of(model)

@@ -122,9 +122,10 @@ def plan(
 ) -> Plan:
     """Return the flows for which the sum of the lower bounds of the mean errors is least.
 
-    The least sum of the lower bounds is a lower bound of the sum of the mean errors for every
-    controller, even for a controller that knows the future. In the proof, y and u are the means
-    of output and applied flow over all noise, loads and random decisions of a controller:
+    Without `past` and `penalty`, the least sum of the lower bounds is a lower bound of the sum
+    of the mean errors for every controller, even for a controller that knows all future set
+    points. In the proof, y and u are the means of output and applied flow over all noise, loads
+    and random decisions of a controller:
 
     - Equation (28) of the paper is linear, so the means y and u satisfy equation (28) without
       noise.
@@ -196,8 +197,9 @@ def _variables(count: int, cost: Any, low: Any, high: Any) -> _Variables:
 
 
 class _Program(NamedTuple):
-    """The linear program that chooses the n flows after the past flows, which are fixed.
+    """The linear program that chooses the n flows between the past flows and the last flow.
 
+    The past flows are fixed, and the last flow of the episode affects no output.
     The effects y of the n flows u on the outputs satisfy A y = B u, where A and B are the
     plant's matrices in equation (28) of the paper. The linear program writes the expected error
     at each sample as a sum of positive pieces minus a sum of negative pieces, with one piece of
@@ -231,6 +233,7 @@ def _program(
 ) -> _Program:
     """Return the linear program that chooses the flows after the first `past_count` flows.
 
+    The linear program leaves out the last flow of the episode, which affects no output.
     `model`, `bounds`, `setpoint` and `quiet` are arguments of `plan`. `flow` has the
     `past_count` past flows, which are fixed, and then zeros, t/h, shape (samples,). `price` has
     the price of each flow, degC per t/h, shape (samples,).
@@ -373,7 +376,8 @@ def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
         planned = plan(model, bounds, expected_setpoint, past=flow[:start], quiet=True)
         flow = planned.flow
         errors[start:stop] = planned.errors[start:stop]
-        # The range of the flows before the change that affect outputs after the change, t/h.
+        # The range of the last lag + 1 flows before the change, t/h: the plant has settled if
+        # the flow has hardly changed in the last `lag` samples.
         flow_range = np.ptp(flow[max(stop - model.lag - 1, start - 1, 0) : stop])
         is_long = stop - start >= model.lag
         has_settled = is_long and flow_range <= SETTLED_FLOW_RANGE * (high - low)

@@ -1,4 +1,4 @@
-"""Compute the variance of the best prediction of a plant's output from noisy readings.
+"""Compute the variance of the best prediction of a plant's output from readings.
 
 A Kalman filter gives the covariance of the plant's state, given the transmitter's readings up
 to a sample. The covariance of the state determines the variance of the best prediction of the
@@ -19,21 +19,21 @@ SMALLEST_VARIANCE = 1e-8
 def noise_variance(model: LinearModel) -> Array:
     """Return the error variances of the best output predictions, degC^2, shape (samples,).
 
-    The best prediction of the output y(k) uses the transmitter's readings up to k - d - 1,
-    where d is the plant's delay in samples. `model` is a plant with noise and without load at
-    the samples k = 0, 1, ... of an episode.
+    The best prediction of the output y(k) uses the transmitter's readings up to the sample
+    k - lag, where lag is `model.lag`. `model` is a plant at the samples k = 0, 1, ... of an
+    episode. The load of the plant counts as 0.
     """
     F, Q = noise_system(model)
     return predicted_variance(noise_covariance(model), F, Q, model.lag)
 
 
 def noise_covariance(model: LinearModel) -> Array:
-    """Return the covariances of a plant's state x(k), given the readings up to k, without load.
+    """Return the covariances of a plant's state x(k), given the readings up to k.
 
     The state x(k), which `noise_system` describes, has the latest outputs of the plant and the
     latest values of the noise. The result has a covariance matrix for each sample k of an
     episode, shape (samples, size, size), where size is the length of the state. The covariances
-    are 0 if the transmitter has no noise.
+    are 0 if the transmitter has no noise. The load of the plant counts as 0.
     """
     F, Q = noise_system(model)
     if model.numbers.measurement_noise_variance == 0.0:

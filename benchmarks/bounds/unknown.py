@@ -3,7 +3,8 @@
 The plant is equation (28) of the paper, A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k), with
 the output y, the flow u_a, the delay d and the white noise xi. A load w(k) adds A(1) w(k) to
 the right side of equation (28) of the paper. The load is the sum of a random walk and of a
-piecewise constant part, whose changes are called *jumps*.
+piecewise constant part, whose changes are called *jumps*. If the first coefficients of B are 0,
+they count as a part of the delay d in this module, so d + 1 is always `LinearModel.lag`.
 
 A flow at sample j affects the output y(j + d + 1) at the earliest. So no flow counteracts the
 effects on y(k) of noise, random walk and jumps after the sample k - d - 1. Let n(k) be the sum
@@ -82,7 +83,7 @@ def error_bounds(model: LinearModel) -> ErrorBounds:
     """Return the lower bounds of the mean errors that noise and load cause, for each sample.
 
     The docstring of the module derives the lower bounds of the mean errors, which assume that
-    the controller knows the load up to sample k - d - 1, where d is the plant's delay. No flow
+    the controller knows the load up to sample k - d - 1, where d + 1 is `model.lag`. No flow
     can counteract the effects of noise and load in the last d + 1 samples.
 
     Parameters
@@ -127,10 +128,10 @@ def bounds_for_normal(variance: Array) -> ErrorBounds:
 class LoadChanges(NamedTuple):
     """The changes of the load that happen too late for any flow to counteract them at y(k).
 
-    The flow at sample k - d - 1 is the last flow that can affect the output y(k), where d is
-    the plant's delay in samples. The changes of the load at the samples from k - d to k are
-    unknown to a controller at sample k - d - 1. The load can change at every sample k above 0
-    that is a multiple of `LOAD_INTERVAL`.
+    The flow at sample k - d - 1 is the last flow that can affect the output y(k), where d + 1
+    is `LinearModel.lag`. The changes of the load at the samples from k - d to k are unknown to
+    a controller at sample k - d - 1. The load can change at every sample above 0 whose number
+    is a multiple of `LOAD_INTERVAL`.
     """
 
     # Row k: effects on y(k), degC, of changes of the load by 1 degC that happen from sample k -
@@ -157,7 +158,7 @@ def load_changes(model: LinearModel) -> LoadChanges:
     steps = model.load_factor[:, np.newaxis] * (ages >= 0) * (times > 0)
     A, _ = equations(model, samples)
     responses = scipy.sparse.linalg.spsolve_triangular(A, steps)
-    responses[ages >= model.lag] = 0.0  # A flow counteracts these changes in time.
+    responses[ages >= model.lag] = 0.0  # A flow can counteract these changes in time.
     changes = k // LOAD_INTERVAL  # number of changes up to k
     known_changes = np.maximum(k - model.lag, 0) // LOAD_INTERVAL
     largest_count = math.ceil(min(model.lag, samples) / LOAD_INTERVAL)
@@ -211,8 +212,8 @@ def _effects_on_output(
     """Return the distribution of n(k), the effect on y(k) that no flow can counteract in time.
 
     The distribution of n(k), degC, depends on the level l, degC, of the load's piecewise
-    constant part at sample k - d - 1, where d is the plant's delay. The parameters are those of
-    `_intercepts_with_jumps`.
+    constant part at sample k - d - 1, where d + 1 is `LinearModel.lag`. The parameters are
+    those of `_intercepts_with_jumps`.
 
     Returns
     -------
@@ -250,9 +251,9 @@ def _intercepts_with_jumps(
     The result has the shape (samples, slopes): for each sample k and each slope s in `SLOPES`,
     it has the intercept a(s) of the line s E[e] + a(s), which is a lower bound of the mean
     error E|e| at sample k. Each intercept a(s) is a mean over the level of the load at sample
-    k - d - 1, where d is the plant's delay. The level of the load is 0 until the first jump of
-    the episode, and then uniformly distributed from -`amplitude` to `amplitude`, degC. The load
-    jumps with the probability `jump_probability` at each sample at which the load can change.
+    k - d - 1, where d + 1 is `LinearModel.lag`. The level of the load is 0 until the first jump
+    of the episode, and then uniformly distributed from -`amplitude` to `amplitude`, degC. The
+    load jumps with the probability `jump_probability` at each sample at which it can change.
 
     `changes` has the changes of the load that are unknown at sample k - d - 1, and `noise` is
     the distribution of the effect on y(k) of the noise xi and of the load's random walk, degC.
@@ -261,7 +262,7 @@ def _intercepts_with_jumps(
         changes, noise, amplitude, jump_probability
     )
     # By symmetry, the intercept at the level -l and the slope s is the intercept at the level l
-    # and the slope -s. So only levels above 0 are computed, with slopes of both signs.
+    # and the slope -s. So no level below 0 is computed, and slopes have both signs.
     both_signs = np.append(SLOPES, -SLOPES)
     half = KNOWN_LEVEL_ATOMS // 2
     levels = [0.0, *(amplitude * (np.arange(half) + 0.5) / half)]

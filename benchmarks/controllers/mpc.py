@@ -1,6 +1,7 @@
 """Control the plant by model predictive control (MPC), with an exact model of the plant.
 
-The controller knows all parameters of the plant, the noise and the load, but neither the future
+The controller knows all arguments of the environment, such as the variance of the noise and the
+amplitude of the load, and the dynamics of the plant. The controller knows neither the values of
 noise and load nor future set points. The mean error of model predictive control shows how close
 to the lower bounds of `benchmarks.bounds` an error can be.
 """
@@ -39,8 +40,9 @@ class _Model:
         Plants of all runs.
     response : Array
         Matrix of each run, from planned flows to changes of outputs, degC per t/h, shape (n,
-        HORIZON, HORIZON). The matrix of a run times the planned flows is the effect of the
-        planned flows on the first HORIZON outputs that they can affect.
+        HORIZON, HORIZON). The matrix of a run times the planned flows from sample k on is the
+        effect of the planned flows on the outputs y(k + d + 1) to y(k + d + HORIZON), where d
+        is the plant's delay in samples.
     hessian : Array
         Transpose of `response` times `response` for each run, (degC per t/h)^2, shape (HORIZON,
         HORIZON, n). The axis of the runs is last, because NumPy operations on all runs are
@@ -88,7 +90,7 @@ class _Model:
 
 
 class PredictiveController:
-    """Plan, at each sample, the flows that bring the expected output to the set point.
+    """Plan, at each sample, the flows that bring forecast outputs to target outputs.
 
     The controller knows the polynomials A, B and C and the delay d of each run's plant,
     equation (28) of the paper, and how A and B drift, even if the environment draws the plants
@@ -206,10 +208,10 @@ class PredictiveController:
     def _targets(self, setpoint: Array) -> Array:
         """Return the target outputs, degC, shape (runs, HORIZON), and store the set points.
 
-        Column i of the result has the target of the first output that planned flow i can
-        affect. `setpoint` has the present set points, degC, shape (runs,). `_targets` must be
-        called once a sample, since the method counts the samples since the latest change of the
-        set point.
+        Column i of the result has the target of the output y(k + 1 + d + i), where k is the
+        present sample and d the delay of the run's plant in samples. `setpoint` has the present
+        set points, degC, shape (runs,). `_targets` must be called once a sample, since the
+        method counts the samples since the latest change of the set point.
         """
         if self._random is None:
             return np.broadcast_to(setpoint[:, np.newaxis], (len(setpoint), HORIZON))
@@ -224,9 +226,9 @@ class PredictiveController:
     def _forecast_deviation(self) -> Array:
         """Return the standard deviation of the forecast error of each run, degC, shape (runs,).
 
-        The forecast is the expected value of the first output that the next flow can affect.
-        The standard deviation is that of a Kalman filter in its steady state, for a plant that
-        does not drift.
+        The forecast is the expected value of the output y(k + d + 1) at sample k, where d is
+        the plant's delay in samples. The standard deviation is that of a Kalman filter after
+        `WARM_UP` samples, computed without drift of the plant.
         """
         self.reset()
         plants = self._model(0).plants
@@ -283,10 +285,11 @@ class PredictiveController:
         return F, np.einsum("nv,niv,njv->nij", variances, E, E)
 
     def _predict(self) -> Array:
-        """Return the expected outputs if all flows from the present sample k on are 0, degC.
+        """Return forecast outputs if all flows from the present sample k on are 0, degC.
 
-        Column i of the result has the expected output y(k + 1 + i) of each run. The number of
-        columns is HORIZON plus the longest delay of a run in samples.
+        The forecasts assume that the load does not change. Column i of the result has the
+        forecast output y(k + 1 + i) of each run. The number of columns is HORIZON plus the
+        longest delay of a run in samples.
         """
         runs = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
         flows = self._flows[runs, self._flow_columns[:, 1:]]

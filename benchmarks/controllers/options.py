@@ -107,8 +107,9 @@ def _name_and_location(word: str) -> tuple[str, str]:
     Raises
     ------
     UsageError
-        If `word` does not have the form NAME=LOCATION, if a controller in `ROSTER` is called
-        NAME, or if the file or the module in LOCATION does not exist.
+        If `word` does not have one of the `FORMS`, if NAME in lower case is the name of a
+        controller in `ROSTER`, or if the file or the top-level package in LOCATION does not
+        exist.
     """
     name, _, location = word.partition("=")
     module, _, factory = location.partition(":")

@@ -288,8 +288,8 @@ class PolicyAgent:
     def _open(self, arguments: Mapping[str, Any]) -> AbstractContextManager[Any]:
         """Return a context manager of a vector environment with `runs` plants.
 
-        `arguments` are keyword arguments of `gymnasium.make`. If the policy has an environment
-        of its own, `arguments` are not used.
+        `arguments` are keyword arguments of `gymnasium.make`. If `env` is not None, `arguments`
+        are not used.
         """
         if self.env is not None:
             return opened(self.env, self.runs, self.policy)

@@ -1,7 +1,7 @@
-"""Convert the intervals in which a search looks for gains from the paper's plant to another.
+"""Compare plants, and compute the intervals in which a search looks for gains for a plant.
 
-The conversion uses the ratios of the gains, time constants, delays and temperature ranges of
-the two plants.
+The comparisons and the intervals depend on the gain, the temperature range, the time constant
+and the delay of a plant.
 """
 
 import math
@@ -96,8 +96,8 @@ def difference(plant: Parameters, made_for: Parameters) -> str:
 def _finite_scale_of(plant: Parameters) -> PlantScale:
     """Return the `PlantScale` of a plant on which a search for gains is to run.
 
-    A ValueError is raised if the gain or another quantity of the plant is 0 or infinite, since
-    the ends of the search intervals are computed from these quantities.
+    A ValueError is raised if any field of the `PlantScale` is 0 or infinite, since the ends of
+    the search intervals are computed from the fields.
     """
     scale = scale_of(plant)
     for name, value in vars(scale).items():

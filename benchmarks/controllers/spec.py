@@ -156,8 +156,8 @@ class ControllerSpec:
     pictured : bool
         Whether comparisons draw the temperature and the flow of the controller over time.
     provenance : mapping
-        Mapping that says how the network of a member was trained, for a JSON file; empty if
-        nothing was trained.
+        Mapping for a JSON file that says where a member comes from, and how its network was
+        trained; empty for a controller without trained networks in `ROSTER`.
     """
 
     name: str
@@ -244,7 +244,7 @@ class ControllerSpec:
         The time constant is the argument of `build` that `tuned_by` names. The control loop
         with the nominal plant is robust enough if its maximum sensitivity Ms is at most
         `sensitivity`. The time constant is rounded to four digits, so that all machines return
-        the same number.
+        the same number. The rounding can raise Ms slightly above `sensitivity`.
         """
         parameters = Parameters(**plant)
         arguments = knowledge(self.prior_knowledge, parameters, 1, 0)
@@ -265,7 +265,7 @@ class ControllerSpec:
         return LinearLoop.of(controller, nominal(Parameters(**plant)))
 
     def misfit(self, plant: Parameters) -> str:
-        """Return why the controller does not fit `plant`, as a sentence; "" if it fits.
+        """Return why the controller does not fit `plant`, as a text; "" if it fits.
 
         The controller fits if `plant` agrees with the plant `made_for` in all properties of
         `assumes`.

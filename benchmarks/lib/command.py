@@ -194,8 +194,8 @@ def run_program(program: str, work: Callable[[], str]) -> int:
 
     The exit status is 0 for success; 1 if tasks failed, the disk is full or the output pipe is
     closed; 130 after Ctrl-C; and 143 after SIGTERM. After a `UsageError`, or if a Python
-    package is missing, the process ends with the exit status 2. Error messages begin with
-    `program`, such as "python -m benchmarks.compare".
+    package is missing, the process ends with the exit status 2. Messages on the standard error
+    stream begin with `program`, such as "python -m benchmarks.compare".
     """
     try:
         last_line = work()

@@ -1,4 +1,4 @@
-"""Define exceptions that end a command with a message and without a traceback."""
+"""Define the exceptions of the benchmarks, and end a command with a message."""
 
 import sys
 from typing import NoReturn
@@ -39,7 +39,7 @@ class UnfinishedError(RuntimeError):
 
 
 class NoBoundError(ValueError):
-    """A scenario has no least possible error of the requested kind.
+    """A case has no least possible error of the requested kind.
 
     For example, a least possible error of the kind "reference" exists only if the plant settles
     before each change of the set point.

@@ -50,8 +50,8 @@ class FanOut:
     ) -> Iterator[tuple[str, Any]]:
         """Run tasks, and yield the name and the result of each task that has succeeded.
 
-        Results are yielded in the order in which tasks finish. With `--backend ray`, results
-        are yielded only after the last task has finished.
+        Saved results are yielded first, and new results in the order in which tasks finish.
+        With `--backend ray`, new results are yielded only after the last task has finished.
 
         Parameters
         ----------
@@ -66,7 +66,8 @@ class FanOut:
         Raises
         ------
         UnfinishedError
-            If tasks failed. The error is raised after all other tasks have finished.
+            If tasks failed: the error is raised after all other tasks have finished. Also if
+            the operating system killed a worker process: the error is raised at once.
         """
         missing: dict[str, Task] = {}
         failures: list[Outcome] = []

@@ -53,8 +53,9 @@ def versions() -> dict[str, str]:
 def commit() -> str:
     """Return the hash of the git commit that is checked out, 40 hexadecimal digits.
 
-    If files have changed since the commit, the text "-dirty" follows the hash of the commit. If
-    git is not installed or the project is not in a git repository, the result is "".
+    If files have changed or have been added since the commit, the text "-dirty" follows the
+    hash of the commit. If git is not installed or the project is not in a git repository, the
+    result is "".
     """
     if not (ROOT / ".git").exists():  # git would search the parent folders.
         return ""

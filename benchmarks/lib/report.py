@@ -138,7 +138,7 @@ def _print(section: Section) -> None:
 
 
 def on_screen(table: pd.DataFrame) -> str:
-    """Return a table as text whose lines are no wider than the terminal.
+    """Return a table as text whose lines are no wider than the terminal, if possible.
 
     A table that is too wide for the terminal is split into several tables, one below the other,
     each with the first column and some of the remaining columns.

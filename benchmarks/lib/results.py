@@ -34,8 +34,8 @@ def results_folder(target: Path, conditions: Mapping[str, Any] | None = None) ->
     """Yield a folder for new results, which replaces `target` at the end of the `with` block.
 
     The yielded folder for the `target` "results/x", for example, is "results/x.unfinished". If
-    the `with` block raises an error or is interrupted, the yielded folder is kept with the
-    results in it, and the folder `target` does not change.
+    the `with` block raises an error or is interrupted, the folder `target` does not change, and
+    the yielded folder is kept with the results in it, or removed if it has no results.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def _earlier(final: Path) -> Path:
 
 
 def _refuse_other_files(final: Path) -> None:
-    """Raise a `UsageError` if the folder `final` has files that no command wrote."""
+    """Raise a `UsageError` if `final` is a file, or has files that no command wrote."""
     if final.exists() and not final.is_dir():
         raise UsageError(f"--out: {final} cannot be written to: it is not a folder")
     recorded = {RECORD_FILE, *_record(final).get("files", [])}
@@ -158,7 +158,7 @@ def _prepare(unfinished: Path, conditions: Mapping[str, Any] | None) -> None:
     Raises
     ------
     UsageError
-        If the folder `unfinished` has files, but no valid `RECORD_FILE`.
+        If `unfinished` is a file, or a folder with files but without a valid `RECORD_FILE`.
     """
     if unfinished.exists() and not unfinished.is_dir():
         raise UsageError(f"--out: {unfinished} must be a folder: remove the file")

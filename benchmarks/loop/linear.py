@@ -182,9 +182,9 @@ class LinearModel:
 
         The state x(k) is the state of `state_space`, followed by the two parts of the load,
         degC: the piecewise constant part at the index `LOAD_STEPS`, and the random walk at the
-        index `LOAD_WALK`. The vector v(k) has three elements: the noise xi(k), the random
-        change of the piecewise constant part, and the step of the random walk. The state
-        equation leaves out the effects of flows.
+        index `LOAD_WALK`. The vector v(k) has three elements: the noise xi(k); the piecewise
+        constant part minus its expected value, given x(k-1); and the step of the random walk.
+        The state equation leaves out the effects of flows.
 
         Parameters
         ----------
@@ -234,10 +234,11 @@ def step_test(parameters: Parameters) -> dict[str, float]:
 
     The step response is the temperature of the nominal plant after a step of the flow, without
     noise. If the temperature has made 28.3 % and 63.2 % of its change at the times t_28 and
-    t_63, the time constant is T = 1.5 (t_63 - t_28), and the delay is t_63 - T (Cecil Smith,
-    "Digital Computer Process Control", 1972). As if read off a chart, the gain is rounded to
-    four digits, the time constant to three digits, and the delay to a whole number of samples.
-    The delay is the time from a flow to the first output that the flow can affect.
+    t_63, the time constant is T = 1.5 (t_63 - t_28), and the dead time is t_63 - T (Cecil
+    Smith, "Digital Computer Process Control", 1972). The returned delay is the dead time plus
+    one sample, since a flow without dead time affects the next output. As if read off a chart,
+    the gain is rounded to four digits, the time constant to three digits, and the delay to a
+    whole number of samples, at least one.
 
     Parameters
     ----------
@@ -271,7 +272,7 @@ def step_test(parameters: Parameters) -> dict[str, float]:
         settling_time = math.log(REMAINING_TRANSIENT) / math.log(plant.slowest_pole)
     # The test lasts twice the settling time, since transients of repeated poles last longer.
     samples = len(parameters.b) + 2 * math.ceil(settling_time) + 2
-    # The response begins with the last sample before the output reacts.
+    # The response begins with the last sample before the output can react.
     response = np.append(0.0, plant.impulse_response(samples).cumsum())
     response /= response[-1]
     late_time = _time_of(LATE_LEVEL, response)  # samples

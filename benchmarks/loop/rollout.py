@@ -39,7 +39,7 @@ class Agent(Protocol):
 
 
 class IdleValve:
-    """A controller that keeps the flow at 0 t/h.
+    """A controller that commands a flow of 0 t/h at every sample.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class IdleValve:
         """Do nothing, since an idle valve does not depend on earlier samples."""
 
     def act(self, observation: NDArray[np.float32]) -> Array:
-        """Return the actions that keep the flow at 0 t/h, shape (runs, 1)."""
+        """Return the actions that command a flow of 0 t/h, shape (runs, 1)."""
         return np.broadcast_to(self.action, (len(observation), 1))
 
 
@@ -177,17 +177,20 @@ def rollout(
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """Return the measures of each run by their names in CSV files, each of shape (runs,).
 
-    `parameters` are the arguments of the environment in which the controller ran. With the
-    error e(k) at the samples k = 1 to N, the measures are:
+    `parameters` are the arguments of the environment in which the controller ran. The measures
+    `mae`, `mae_start`, `mae_changes`, `mae_steady` and `ise` use the errors e(k) at the samples
+    k = 1 to N, and the other measures use the signals at the samples k = 0 to N - 1. A set
+    point other than 0 at k = 0 counts as a set-point change for `overshoot` and
+    `settling_time`. The measures are:
 
     - `mae`: mean of |e(k)|, degC;
-    - `mae_start`: contribution of the first `START_SAMPLES` samples to `mae`, degC;
+    - `mae_start`: contribution of the samples k below `START_SAMPLES` to `mae`, degC;
     - `mae_changes`: contribution to `mae` of the later samples that lie less than
       `RESPONSE_SAMPLES` samples after a set-point change, degC;
     - `mae_steady`: contribution of the remaining samples to `mae`, degC;
     - `ise`: integral of e^2 over time, degC^2 min;
     - `itae`: integral of t |e| over time, degC min^2, where t is the time since the latest
-      set-point change;
+      set-point change, or since k = 0 before the first change;
     - `total_variation`: valve travel, the sum of the magnitudes of all changes of the applied
       flow, t/h, including the first change from 0 t/h;
     - `overshoot`: largest distance of the output beyond a new set point, in percent of the
@@ -243,7 +246,9 @@ def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
 
 
 def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]:
-    """Return the percentages of commands in the dead zone and at a limit, of shape (runs,).
+    """Return the percentages of commands in the dead zone and at or beyond a limit.
+
+    The returned dict has arrays of shape (runs,) by the names of the measures in `measure`.
 
     The percentages are NaN if the dead zone or a limit of the flow in `parameters` is a range.
     `command` has the commanded flows, t/h, shape (samples, runs).
@@ -319,8 +324,8 @@ def mean_error(trajectory: Trajectory) -> Array:
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
     """Return whether the output of each run has settled at the end of the run, shape (runs,).
 
-    The output has settled if each of the last `LAST_SAMPLES` errors of the run is at most
-    `SETTLING_BAND` times the set point.
+    The output has settled if the magnitude of each of the last `LAST_SAMPLES` errors of the run
+    is at most `SETTLING_BAND` times the magnitude of the set point.
     """
     setpoint = trajectory.setpoint[-LAST_SAMPLES:]
     output = trajectory.output[-LAST_SAMPLES:]
