@@ -31,7 +31,8 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
 
     Rounding to float32 can move a command on the edge of the dead zone into the dead zone,
     where the command has no effect. An action that rounding moved into the dead zone is moved
-    out again by one float32 step. All arguments broadcast as in NumPy.
+    out again by the spacing of float32 numbers near 1, or near the action if its size is above
+    1. All arguments broadcast as in NumPy.
 
     Parameters
     ----------
@@ -50,7 +51,8 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     lost_its_effect = (np.abs(command) >= dead_zone) & (np.abs(rounded) < dead_zone)
     if not lost_its_effect.any():
         return action
-    # The plant adds 1, which rounds away steps finer than the float spacing at 1.
+    # The plant adds 1 to the action, so the rounding of the sum can remove a step that is much
+    # smaller than the float32 spacing near 1.
     spacing = np.spacing(np.maximum(np.abs(action), np.float32(1)))
     outwards = action + np.copysign(spacing, command)
     return np.where(lost_its_effect, outwards, action).astype(np.float32)

@@ -5,8 +5,8 @@ divided by half the flow range, (u_max - u_min) / 2. Temperatures are divided by
 temperature change that half the flow range causes according to the step test. Times are divided
 by the sampling interval. A positive dimensionless flow raises the temperature.
 
-The last axis of every array is the plant: arrays have the shape (n,), (time constants, n) or
-(delays, time constants, n), for n plants.
+The last axis of every array is the plant. For n plants, an array has for example the shape
+(n,), (time constants, n) or (delays, time constants, n).
 """
 
 from __future__ import annotations
@@ -41,18 +41,23 @@ LOAD_POLE: Final = 0.98
 # Expected standard deviation of the models' one-step prediction errors before the first sample,
 # in units of the steady temperature change for half the flow range.
 FIRST_NOISE: Final = 0.07
-FIRST_NOISE_SAMPLES: Final = 30.0  # weight of `FIRST_NOISE`, as a number of samples
-LEAST_NOISE_RATE: Final = 0.004  # least weight of the newest error in the noise variance
+# The squared prediction error of the first sample has the weight 1 / `FIRST_NOISE_SAMPLES` in
+# the noise variance, and FIRST_NOISE^2 has the rest of the weight.
+FIRST_NOISE_SAMPLES: Final = 30.0
+# Least weight of the newest squared prediction error in the noise variance.
+LEAST_NOISE_RATE: Final = 0.004
 # Least standard deviation of the noise, in units of the steady temperature change for half the
 # flow range. Smaller errors would come from the low order of the models, not from noise.
 LEAST_NOISE: Final = 0.003
-# Largest squared prediction error, as a multiple of the noise variance. Larger squares are
-# clipped, so that an outlier has little influence.
+# Largest mean over the models of the squared prediction error, as a multiple of the noise
+# variance. A larger mean is clipped before it updates the noise variance, so an outlier has
+# little influence on the noise variance. The log-likelihoods use squares without clipping.
 LARGEST_SQUARE: Final = 16.0
 GAIN_LIMITS: Final = (0.3, 3.0)  # least and greatest gain, as multiples of the step test's
 # Least value of ln(p / q), for a model's probability p and the greatest probability q.
 LEAST_LOGARITHM: Final = -30.0
-# Samples between updates of the models' probabilities, which take the most computing time.
+# Samples between updates of the models' gains and probabilities. These updates take the most
+# computing time.
 ESTIMATE_INTERVAL: Final = 2
 LAGS: Final = 4  # number of latest outputs and of latest mean model outputs that a bank keeps
 
@@ -123,8 +128,8 @@ class UndelayedModels:
     def __init__(
         self, time_constants: Array, convert: Callable[[Array], Any] = np.asarray
     ) -> None:
-        # An undelayed model is a plant model with a gain of 1 and no delay. The list has the
-        # factors a1, a2, b1 and b2 of its equation, each of shape (time constants, n).
+        # The factors a1, a2, b1 and b2 in the equation of the models, each of shape (time
+        # constants, n).
         self._coefficients = [convert(values) for values in model_coefficients(time_constants)]
         self.outputs = convert(np.zeros_like(time_constants))
         self.last_outputs = self.outputs
@@ -210,8 +215,8 @@ class Bank:
         Estimated mean of the share exp(-(d + 1) / T) of a deviation with the time constant T
         that remains after d + 1 samples, for the delay d and T in samples, shape (n,).
     variance : ndarray
-        Estimated variance of the models' one-step prediction errors, in squared units of the
-        steady temperature change for half the flow range, shape (n,).
+        Estimated variance of the models' one-step prediction errors of the whitened output, in
+        squared units of the steady temperature change for half the flow range, shape (n,).
     innovation : ndarray
         Newest one-step prediction error of the whitened output, as a mean over the models, in
         units of the steady temperature change for half the flow range, shape (n,).
@@ -271,7 +276,8 @@ class Bank:
         self._delayed[1:] = self._delayed[:-1]
         self._regressors[1:] = self._regressors[:-1]
         rows = (self._k - self._shortest_delays) % len(self._ring)
-        # The index selects a row for each plant. The result has the plants as its first axis.
+        # The index selects a row for each plant, and makes the plants the first axis. The
+        # transposition makes the plants the last axis again.
         newest = self._ring[rows, :, :, np.arange(self.n)].transpose(1, 2, 0)
         self._delayed[0], self._regressors[0] = newest
         self._learn(self._whiten_output(self.outputs[0].copy()))
@@ -307,8 +313,8 @@ class Bank:
         squares = np.square(errors)
         self._log_likelihoods *= MODEL_FORGETTING
         self._log_likelihoods -= squares * (0.5 * LIKELIHOOD_FACTOR / self.variance)
-        # At the start of an episode, the noise variance is the mean of all squared errors so
-        # far.
+        # At the start of an episode, the noise variance is a mean of the first guess
+        # FIRST_NOISE^2 and all squared errors so far.
         rate = max(LEAST_NOISE_RATE, 1.0 / (FIRST_NOISE_SAMPLES + self._k))
         square = np.einsum("dtn,dtn->n", self._weights, squares)
         square = np.minimum(square, LARGEST_SQUARE * self.variance)
@@ -321,7 +327,7 @@ class Bank:
 
     def _renew_estimates(self) -> None:
         """Update the gains and probabilities of the models, and the means over the models."""
-        # Weight of the prior gain, which is 1, in the least squares estimate of the gain.
+        # Weight of the prior mean of the gain, 1, in the least squares estimate of the gain.
         of_prior = self.variance / np.square(self.gain_spread)
         gains = (self._products + of_prior) / (self._information + of_prior)
         self._gains = np.clip(gains, *GAIN_LIMITS)

@@ -147,8 +147,8 @@ class Controller(ABC):
     Parameters
     ----------
     u_min
-        Lower limit of the actuator's flow, t/h, which the action -1 commands. The controller
-        does not clip commands to the limits.
+        Lower limit of the actuator's flow, t/h, which the action -1 commands. Some controllers,
+        such as `PIController`, also command flows beyond the limits.
     u_max
         Upper limit of the actuator's flow, t/h, which the action 1 commands.
 
@@ -194,8 +194,8 @@ class Controller(ABC):
     def reset(self) -> None:
         """Forget past samples before a new episode, but keep learnt network weights."""
         self.command = np.float64(0.0)
-        # Shape of the commands since `reset`: () for one loop, (batch,) for a batch of loops,
-        # and None before the first sample.
+        # Shape that commands must have until the next `reset`: () for one loop, (batch,) for a
+        # batch of loops, and None while both are allowed.
         self._loop_shape: tuple[int, ...] | None = None
 
     def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
@@ -207,8 +207,8 @@ class Controller(ABC):
         Parameters
         ----------
         parameters
-            Parameter values of the plants, as attributes named as in `mptc_gym.Parameters`. A
-            value that differs between the plants is an array of shape (n,).
+            Arguments of the environment, a `mptc_gym.Parameters`. An argument that is sampled
+            at each reset is a range (low, high).
         wrapped
             Names of the environment's wrappers that change observations or actions; "" if there
             are none.
@@ -255,7 +255,8 @@ class Controller(ABC):
         ----------
         observation
             Observation of shape (n_obs,) for one loop, or (batch, n_obs) for a batch of loops.
-            Elements that the controller does not need are ignored.
+            The values of elements that the controller does not need have no effect. A
+            `PolicyNetwork` needs exactly n_obs elements, and other controllers at least n_obs.
 
         Returns
         -------

@@ -28,8 +28,9 @@ class DahlinController(InternalModelController):
 
     - A first-order model, x(k+1) = p x(k) + b u_a(k), runs in parallel with the plant, where x
       is the output of the model without delay, p the pole, b the input gain, and u_a the flow
-      that leaves the actuator. For a delay of d samples, the prediction of the plant's output
-      y(k) is x(k-d).
+      that leaves the actuator. The prediction of the plant's output y(k) is x(k-d), for the
+      transport delay d, in samples, of equation (28) of the paper. The argument `delay` is d +
+      1 sampling intervals.
     - The estimated disturbance D(k), degC, is the low-pass filtered difference between the
       measured output and the model's delayed output: D(k) = D(k-1) + f (y(k) - x(k-d) -
       D(k-1)).
@@ -45,9 +46,10 @@ class DahlinController(InternalModelController):
     Parameters
     ----------
     closed_loop_time_constant
-        lambda, the time constant of the response to a step of the set point, s. Errors up to
-        0.5 |gain| dead_zone closed_loop_time_constant / time_constant, degC, are not corrected,
-        because a command inside the dead zone has no effect.
+        lambda, the time constant of the response to a step of the set point, s. If the flow and
+        the model's output are 0, errors up to about 0.5 |gain| dead_zone
+        closed_loop_time_constant / time_constant, degC, are not corrected, because a command of
+        less than half of `dead_zone` is moved to 0.
     filter_time_constant
         T_f, the time constant of the low-pass filter of the estimated disturbance, s; 0 for no
         filter, as in Dahlin's paper. A larger filter time constant makes the closed loop more

@@ -215,7 +215,7 @@ class DirectNNController(Controller):
         super().check_environment(parameters, wrapped, n)
         if self.num_envs != n:
             raise ValueError(
-                f"policy must have num_envs={n}, one loop per episode, got {self.num_envs or 1}"
+                f"policy must have num_envs={n}, one loop per episode, got {self.num_envs}"
             )
 
     def reset(self) -> None:

@@ -50,7 +50,7 @@ class RandomSetpoint:
         """
         durations = self.longest - self.shortest + 1.0  # number of possible durations
         # Share of the possible durations that are longer than `ages`, and share that are longer
-        # than `ages + ahead`. The lower bound 1e-9 prevents a division by 0.
+        # than `ages + ahead`. The least share 1e-9 prevents a division by 0.
         share_now = np.clip((self.longest - ages) / durations, 1e-9, 1.0)
         share_later = np.clip((self.longest - ages - ahead) / durations, 0.0, 1.0)
         probability: Array = share_later / share_now
@@ -74,8 +74,8 @@ class RandomSetpoint:
         setpoints
             Present set points s, in the unit of `amplitude`, shape (n,).
         held
-            Probabilities that the set points do not change within the plants' delays, shape
-            (n,).
+            Probabilities that the set points do not change before the present flows affect the
+            outputs, shape (n,).
         deviations
             Standard deviations of the forecast errors, in the unit of `amplitude`, shape (n,).
         """
@@ -90,4 +90,5 @@ class RandomSetpoint:
             near_zero = np.where(is_too_near_zero, targets, near_zero)
             near_setpoint = np.where(is_too_near_zero, near_setpoint, targets)
         targets = 0.5 * (near_zero + near_setpoint)
-        return np.where(held >= 1.0, setpoints, targets)  # exact if `held` is 1
+        # If no change is possible, the target is the set point, without the error of bisection.
+        return np.where(held >= 1.0, setpoints, targets)

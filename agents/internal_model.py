@@ -26,14 +26,15 @@ class InternalModelController(ModelBasedController):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._pole = math.exp(-self.sampling_interval / self.time_constant)
-        self._input_gain = self.gain * (1.0 - self._pole)  # degC per t/h and sample
+        # Effect of a flow on the model's next output, degC per t/h.
+        self._input_gain = self.gain * (1.0 - self._pole)
         self._delay = max(round(self.delay / self.sampling_interval), 1)  # samples
 
     def reset(self) -> None:
         """Set the model's output to 0 before a new episode, as for a plant at rest."""
         super().reset()
-        # Outputs of the undelayed model at the latest samples, as many as the delay, degC. The
-        # newest output is last.
+        # Outputs of the undelayed model at the latest samples, degC, at most `_delay` outputs.
+        # The newest output is last.
         self._outputs: list[Values] = [np.float64(0.0)]
 
     @property

@@ -26,9 +26,10 @@ from agents.output_filter import LOAD_CHANGES, OutputFilter
 
 Array = NDArray[np.floating[Any]]
 
-SHARE: Final = 0.5  # share of the gap to the target that one sample closes, without a network
-# Standard deviation of a forecast over the plant's delay, as a multiple of the standard
-# deviation of the noise.
+# Fraction `share` of the control law (see `Law`), without a network.
+SHARE: Final = 0.5
+# Standard deviation of the error of a forecast over the plant's delay, as a multiple of the
+# standard deviation of the models' one-step prediction errors.
 FORECAST_SPREAD: Final = 1.2
 REACTION: Final = 2.0  # samples, after the delay, that the output takes to respond to a flow
 # Limit of the errors that are inputs of a network, as a multiple of the noise's standard
@@ -66,7 +67,7 @@ class Situation:
     """Probabilities of the candidate time constants, shape (time constants, n)."""
     pole: Array
     """Estimated pole of the plant: the mean of exp(-1 / T) over the candidate time constants T
-    in samples, shape (n,)."""
+    in samples, with the probabilities of the time constants as weights, shape (n,)."""
     gain: Array
     """Estimated gain of the plant, divided by the gain that the step test measured, shape
     (n,)."""
@@ -117,7 +118,9 @@ class Observer:
         self._middle_flow = (limits[0] + limits[1]) / 2.0
         self._random_setpoint = setpoint
         self._setpoint: Array | None = None
-        self._age: Array = np.zeros(bank.n)  # samples since the last change of the set point
+        # Number of samples since the last change of the set point. Before a change, the number
+        # of observations since the start of the episode.
+        self._age: Array = np.zeros(bank.n)
         self._k = 0
 
     def observe(self, setpoint: Array, output: Array) -> Situation:
@@ -137,9 +140,10 @@ class Observer:
         """
         bank = self._bank
         bank.observe(output)
-        # `responses` are mean outputs of the models with gain 1, newest first, shape (LAGS, n);
-        # the filter needs those of this sample and of the last. `fading` is the share of a
-        # deviation from the models that remains after the delay, shape (n,).
+        # `bank.responses` are mean outputs of the models with gain 1, newest first, shape
+        # (LAGS, n). The Kalman filters need the mean outputs of this and of the previous
+        # sample. `bank.fading` is the share of a deviation from the models that remains after
+        # the delay, shape (n,).
         self.filter.update(output, bank.responses[:2], bank.pole, bank.variance)
         forecast = self.filter.forecast(bank.pole, bank.fading)
         # At the first sample of an episode, there is no earlier set point to differ from.
@@ -252,11 +256,12 @@ class Law:
     output m. If the output shall reach a target r, the control law computes the flow f = (r +
     share (r - m) / (1 - p)) / g, with a number `share` from 0 to 1. Then the control law moves
     the flow f out of the dead zone, and clips f to the flow limits. The part r / g of the flow
-    keeps the output m at the target r. The other part of the flow closes the fraction `share`
-    of the gap r - m between target and output in one sample. A neural network can correct the
-    control law by three outputs:
+    keeps the output m at the target r. For a model of first order, the other part of the flow
+    closes the fraction `share` of the gap r - m between target and output in one sample. A
+    neural network can correct the control law by three outputs:
 
-    - a number that is added to the target r, in units of the noise's standard deviation,
+    - a number that is added to the target r, in units of the noise's standard deviation less
+      `LEAST_NOISE`,
     - a relative change of the target r, in units of the standard deviation of the estimated
       gain,
     - half the logit of the fraction `share`.
@@ -295,8 +300,9 @@ class Law:
     def flow(self, situation: Situation, network: Network | None = None) -> Any:
         """Return the flows of a sample, as shares of half the flow range, shape (n,).
 
-        Each flow is within the flow limits, and is 0 or outside the dead zone. Call this method
-        once per sample, as the call also updates the outputs of the models.
+        Each flow is within the flow limits. If the flow limits are outside the dead zone, each
+        flow is 0 or outside the dead zone. Call this method once per sample, as the call also
+        updates the outputs of the models.
 
         Parameters
         ----------
@@ -323,8 +329,9 @@ class Law:
             target = target * (1.0 + spread * stretch) + noise * shift
             # The exponent is clipped to prevent an overflow.
             share = 1.0 / (1.0 + xp.exp(xp.clip(-2.0 * half_logit, -20.0, 20.0)))
-        # The flow target / gain keeps the output at the target. The flow approach / gain closes
-        # a share of the gap to the target in one sample.
+        # The flow target / gain keeps the output at the target. For a model of first order, the
+        # flow approach / gain closes the fraction `share` of the gap to the target in one
+        # sample.
         rate = 1.0 - convert(situation.pole)
         approach = share / rate * (target - model_output)
         flow = self._passable((target + approach) / gain)

@@ -171,8 +171,8 @@ class Increments:
     """Settings of a controller in velocity form, whose network outputs changes of the flow.
 
     The wanted flow is 0 at the start of an episode. At each sample, the wanted flow changes by
-    `max_move` times the output of the network. The command is the wanted flow with a
-    compensation of the actuator's dead zone.
+    `max_move` times the output of the network, and is clipped to the flow limits. The command
+    is the wanted flow with a compensation of the actuator's dead zone.
     """
 
     max_move: float

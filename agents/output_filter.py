@@ -40,9 +40,9 @@ RESIDUAL, CARRIED, LOAD, GAIN = range(4)
 class OutputFilter:
     """Kalman filters of n plants, with different assumptions on load disturbance and noise.
 
-    The measured output is y(k) = g(k) s(k) + v(k), where g is the plant's gain, s the mean
-    output of the candidate models with gain 1, and v a residual. The residual v is the sum of
-    noise and of the effect of a load disturbance w:
+    The measured output is y(k) = g(k) s(k) + v(k) plus white measurement noise, where g is the
+    plant's gain, s the mean output of the candidate models with gain 1, and v a residual. The
+    residual v is the sum of the plant's noise and of the effect of a load disturbance w:
 
         v(k) = a1 v(k-1) + a2 v(k-2) + (1 - a1 - a2) w(k) + xi(k) + c xi(k-1)
         w(k) = LOAD_MEMORY w(k-1) + eta(k)
@@ -54,8 +54,9 @@ class OutputFilter:
     xi(k), w(k) and g(k).
 
     The Kalman filters differ in the assumed standard deviation of load changes, eta, and in the
-    assumed variance of the noise xi. The weight of a Kalman filter is the likelihood of its
-    one-step prediction errors, in which old errors are forgotten exponentially.
+    assumed variances of the noise xi and of the measurement noise. The weight of a Kalman
+    filter is in proportion to a power of the likelihood of its one-step prediction errors, in
+    which old errors are forgotten exponentially.
 
     Parameters
     ----------

@@ -71,7 +71,7 @@ class PIController(Controller):
         sampling_interval: float = 8.0,
         **arguments: Any,
     ) -> PIController:
-        """Return a controller tuned by the SIMC rule, with anti-windup.
+        """Return a controller tuned by the SIMC rule, by default with anti-windup.
 
         The SIMC rule for PI controllers was published by Skogestad, "Simple analytic rules for
         model reduction and PID controller tuning", Journal of Process Control 13, 2003,

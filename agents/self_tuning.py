@@ -82,16 +82,16 @@ class SelfTuningController(ModelBasedController):
       adaptive estimation of sampled stochastic processes", IEEE Transactions on Automatic
       Control 10, 1965, 434-439).
     - Kalman filters estimate the plant's gain and load disturbance (`agents.output_filter`).
-    - For a set point that changes at random, the target of the output lies between the set
-      point and 0, because the set point may change within the plant's delay (`agents.hedge`).
+    - If `setpoint_holds` is given, the target of the output lies between the set point and 0,
+      because the set point may change within the plant's delay (`agents.hedge`).
     - As in a Smith predictor, the models predict the effect of past flows that have not yet
       affected the output. The next flow moves the predicted output towards the target
       (`agents.law`).
 
     Every command is 0 or outside the dead zone. The controller suits plants with a positive or
-    negative gain, any flow limits and any sampling interval, because all internal quantities
-    are dimensionless. On a plant with a time constant of 90 samples or more, the controller
-    changes the command at every second sample or less often.
+    negative gain, any flow limits outside the dead zone and any sampling interval, because all
+    internal quantities are dimensionless. On a plant with a time constant of 90 samples or
+    more, the controller changes the command at every second sample or less often.
 
     All other parameters are described in `ModelBasedController`.
 
@@ -125,8 +125,8 @@ class SelfTuningController(ModelBasedController):
         super().__post_init__()
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
         # On a slow plant, the controller changes the command at every `_samples_held`-th
-        # sample. The time constant, divided by the interval between these samples, is then
-        # similar to the time constants in the training of the networks.
+        # sample. The time constant, divided by the interval between these samples, is then at
+        # most twice `TRAINED_TIME_CONSTANT`.
         time_constant = self.time_constant / self.sampling_interval  # samples
         self._samples_held = max(1, int(time_constant / TRAINED_TIME_CONSTANT))
         self._interval = self.sampling_interval * self._samples_held  # s
@@ -142,8 +142,8 @@ class SelfTuningController(ModelBasedController):
     def _prior_of_plant(self) -> Prior:
         """Return the candidate models of one plant and their prior probabilities.
 
-        A ValueError is raised if `delay_range` contains more than `MOST_DELAYS` candidate
-        delays.
+        A ValueError is raised if `delay_range`, or by default the range that follows from
+        `delay`, contains more than `MOST_DELAYS` candidate delays.
         """
         likely = self.delay / self._interval
         if self.delay_range is None:
@@ -282,8 +282,8 @@ class NeuralSmithPredictor(NeuralSelfTuningController):
     """A neural controller that relies on a step test, and does not identify the plant.
 
     The controller is a `NeuralSelfTuningController` whose only candidate model is the model
-    from the step test, with a fixed gain. All parameters except `delay_range` are described in
-    `NeuralSelfTuningController`.
+    from the step test, with a gain that hardly changes. All parameters except `delay_range` are
+    described in `NeuralSelfTuningController`.
     """
 
     delay_range: None = field(init=False, default=None)

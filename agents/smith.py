@@ -72,7 +72,9 @@ class SmithPredictor(InternalModelController):
     def reset(self) -> None:
         """Set the integral part and the model's output to 0, before a new episode."""
         super().reset()
-        self._integral: Values = np.float64(0.0)  # -Ki times the sum of past errors, t/h
+        # Integral part of the command, t/h. Without saturation, the integral part is -Ki times
+        # the sum of the past inputs of the PI controller.
+        self._integral: Values = np.float64(0.0)
 
     def transfer(self) -> tuple[Array, Array]:
         """Return the transfer function from the error e to the command u, t/h per degC.

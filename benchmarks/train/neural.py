@@ -8,7 +8,7 @@ Journal of Process Control 116, 2022, 80-92).
 
 The training is fast, because the estimates of the plants' parameters are computed in NumPy,
 without gradients, and because the loss is an expected control error: a formula averages over
-later noise and later changes of the set point.
+the noise and the set-point changes that come after the last command that affects an output.
 """
 
 import copy
@@ -82,7 +82,8 @@ class Net(nn.Module):
         self.cell = nn.GRUCell(INPUTS, nodes)
         self.hidden = nn.Linear(INPUTS + nodes, hidden)
         self.output = nn.Linear(hidden + INPUTS, OUTPUTS)
-        with torch.no_grad():  # small corrections at first: nearly a linear control law
+        # Small corrections at first: nearly the control law without a network.
+        with torch.no_grad():
             self.output.weight.mul_(0.1)
             self.output.bias.zero_()
         self.state = torch.zeros(0, nodes)
@@ -126,7 +127,7 @@ class Loops:
     """Control loops of n plants with the neural self-tuning controller, simulated from rest.
 
     The controller gets set points and outputs divided by the steady temperature change, degC,
-    that half the actuator's range causes in the plant.
+    that half the actuator's range causes according to the step test of the plant.
 
     Parameters
     ----------
@@ -305,14 +306,14 @@ def expected_error(
     decisions = decisions.clamp(min=0)
     setpoints = batch.setpoints.gather(0, decisions)
     if_kept = mean_distance(setpoints - expected_outputs, deviations)
-    # The mean distance of y from a uniform level in [-A, A] is (A^2 + y^2) / 2A.
+    # For |y| <= A, the mean distance of y from a uniform level in [-A, A] is (A^2 + y^2) / 2A.
     amplitudes = batch.amplitudes
     squares = amplitudes.square() + expected_outputs.square() + deviations.square()
     if_changed = squares / (2.0 * amplitudes)
     chances = chance_of_change(batch.setpoint_ages.gather(0, decisions), delays + 1.0)
     chances = chances * batch.has_random_setpoint
     errors = (1.0 - chances) * if_kept + chances * if_changed
-    # At the start of an episode, no command may affect any output yet.
+    # At the start of an episode, it is possible that no output is affected by a command.
     return (errors * is_affected).sum() / is_affected.sum().clamp(min=1)
 
 
@@ -344,7 +345,7 @@ def train(training: Training, seed: int) -> RecurrentNetwork:
     seed
         Seed of the initial weights, the plants, the set points and the noise.
     """
-    torch.set_num_threads(1)  # the network is too small for more
+    torch.set_num_threads(1)  # the network is too small for more threads
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         net = Net(training.nodes, training.hidden)
@@ -391,7 +392,8 @@ def optimise(training: Training, net: Net, seed: int) -> Net:
         loss.backward()
         nn.utils.clip_grad_norm_(net.parameters(), training.largest_gradient)
         optimiser.step()
-        # In the first steps, the mean of all steps so far takes the place of the running mean.
+        # In the first steps, the weights in `mean` are the mean of the weights after all steps
+        # so far, and later an exponential mean.
         share = max(1.0 - training.averaging, 1.0 / (step + 1.0))
         with torch.no_grad():
             for weights, new_weights in zip(mean.parameters(), net.parameters(), strict=True):

@@ -25,15 +25,18 @@ HALF_RANGE: Final = (PAPER.range_of("u_max")[1] - PAPER.range_of("u_min")[0]) / 
 HARD: Final = PRESETS["hard"]  # arguments of the environment `MiddlePointHard-v0`
 # Shortest and longest time for which a random set point of `hard` keeps a level, samples.
 HOLD_TIMES: Final = (100, 300)
-# A hold time that never ends, samples, for set points that do not change at random.
+# A hold time that never ends, samples, for plants whose controllers expect no change of the set
+# point.
 UNCHANGED: Final = 1e30
 DELAYS: Final = 13  # number of delays among the candidate models of each plant
-# Standard deviation of the logarithm of the time constant from an inexact step test.
+# Standard deviation, before clipping, of the error of an inexact step test: of the logarithm of
+# the found time constant divided by the true time constant.
 TIME_CONSTANT_SPREAD: Final = 0.35
 EXACT_GAIN_SPREAD: Final = 1e-3  # like `GAIN_SPREAD`, for the gain from an exact step test
 # Standard deviation, samples, of the prior distribution of the delay for some plants.
 DELAY_SPREAD: Final = 4.0
-# Logarithm of the probability of a model that an exact step test excludes, in effect 0.
+# Logarithm of the prior probability of a model that an exact step test excludes. The prior
+# probability is in effect 0.
 IMPROBABLE: Final = -200.0
 # Ranges of the environment's arguments. The parameter values of all training plants, which are
 # new in every episode, are within these ranges.
@@ -57,7 +60,8 @@ class Batch:
     """Random plants for an episode, and what controllers know of the plants in advance."""
 
     numbers: dict[str, Tensor]
-    """Parameter values of the plants, by the environment's arguments, each of shape (n,)."""
+    """Parameter values of the plants, by name of the environment's argument, each of shape
+    (n,)."""
     setpoints: Tensor
     """Set points at k = 0 to SAMPLES, degC, shape (SAMPLES + 1, n)."""
     setpoint_ages: Tensor
@@ -65,13 +69,15 @@ class Batch:
     innovations: Tensor
     """White noise xi of equation (28) of the paper, degC, shape (SAMPLES + 1, n)."""
     has_random_setpoint: Tensor
-    """Whether the set point of a plant changes at random times, as in the preset `hard`, shape
-    (n,)."""
+    """Whether a plant is like those of the preset `hard`, shape (n,). Only for these plants do
+    the controllers and the loss of the training expect random changes of the set point. The set
+    points of all other plants also change, as a surprise."""
     amplitudes: Tensor
     """Largest possible set point of each plant, degC, shape (n,)."""
     random_setpoint: RandomSetpoint
-    """Distribution of the set points, which the controllers know; the amplitudes are divided by
-    `temperature_ranges`."""
+    """Distribution of the set points that the controllers assume, with amplitudes divided by
+    `temperature_ranges`. For plants unlike the preset `hard`, the controllers assume that the
+    set point never changes."""
     prior: Prior
     """Candidate models of the plants and the models' probabilities, which the controllers know
     in advance."""
@@ -275,8 +281,8 @@ class Sampler:
         time constant. For a plant like those of the preset `hard` (`is_hard`), a step test
         finds the middle of the range that `hard` has for the gain or time constant. For a plant
         unlike `hard`, a step test finds the true value if `is_exact` is true, and otherwise a
-        value with a random error. The logarithm of the found value divided by the true value
-        has the standard deviation `spread`.
+        value with a random error: the logarithm of the found value divided by the true value is
+        normally distributed with the standard deviation `spread`, and clipped to +-2 `spread`.
         """
         middle = sum(HARD["gain_factor"]) / 2.0  # for the time constant, the range is equal
         normal = torch.randn(self._n, generator=self._generator).clamp(-2.0, 2.0)
@@ -290,20 +296,24 @@ class Sampler:
 
         Each plant has one candidate model for each pair of a delay and a time constant. For a
         plant with an exact step test (`is_exact`), the candidate model from the step test has
-        the probability 1. For half of the plants unlike the preset `hard` (`is_hard`), models
-        with a wrong delay are less probable. `time_constant_factors` are the time
-        constants from step tests, as multiples of the paper's time constant, shape (n,).
+        in effect the probability 1. For half of the plants unlike the preset `hard`
+        (`is_hard`), models with a wrong delay are less probable. `time_constant_factors` are
+        the time constants from step tests, as multiples of the paper's time constant, shape
+        (n,).
         """
         poles = 1.0 - (1.0 - POLE) / time_constant_factors
         time_constants = -1.0 / torch.log(poles)  # samples
-        # Index of each plant's true delay among the delays of its candidate models, from 0.
+        # Index, from 0, of a plant's true delay among the delays of the candidate models. The
+        # index is smaller if the shortest delay would be below 1 sample, and is not used for
+        # plants like those of `hard`.
         places = self._uniform(0.0, DELAYS).floor()
         shortest = (delays - places).clamp(min=1.0)
         shortest = torch.where(is_hard, HARD["delay"][0], shortest)
         # The delay of each model minus the plant's delay, samples, shape (DELAYS, n).
         delay_errors = torch.arange(float(DELAYS))[:, None] - (delays - shortest)
         has_delay_prior = ~is_hard & self._true_for(0.5)
-        # Both priors are normal distributions, the second one of the time constant's logarithm.
+        # The prior of the delay, and of the logarithm of the time constant, is a normal
+        # distribution.
         delay_terms = -0.5 * (delay_errors / DELAY_SPREAD).square() * has_delay_prior
         time_constant_terms = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
         # The logarithm of each model's probability, shape (DELAYS, time constants, n).

@@ -2,7 +2,7 @@
 
 The dict `RECIPES` has a recipe `ppo` for the paper's plant, and a recipe `ppo-hard` for plants
 that differ between episodes. The module `benchmarks/examples/sb3.py` has the code of the
-training, and explains why the training succeeds.
+training, and explains why the training is fast.
 """
 
 import time
@@ -57,7 +57,8 @@ class Recipe:
     # uses these cases.
     cases: Mapping[str, Mapping[str, Any]]
     # Half width of the dead zone that is compensated between policy and plant, t/h; 0 for no
-    # compensation. A comparison replaces a half width above 0 by that of the plant.
+    # compensation. A comparison replaces a half width above 0 by the half width of the plant's
+    # dead zone, unless the plant's half width is a range.
     dead_zone: float
     # Whether the policy's inputs include the set point and the flow, in addition to the error
     # and to changes of set point, temperature and flow.
@@ -127,7 +128,8 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
 
     In the adapted recipe, set points, errors and temperatures are scaled in proportion to the
     plant's argument `setpoint_amplitude`. If the plant has no noise, most training plants get
-    noise in proportion to the largest temperature change that the flow can cause.
+    noise, whose standard deviation is in proportion to the steady temperature change by half
+    the flow range.
 
     Parameters
     ----------
@@ -213,7 +215,7 @@ def begin(recipe: Recipe, seed: int) -> PPO:
 
     `seed` is the seed of the initial weights, the exploration and the plants.
     """
-    torch.set_num_threads(1)  # the networks are too small for more
+    torch.set_num_threads(1)  # the networks are too small for more threads
     layers = {"pi": list(recipe.hidden), "vf": [64, 64]}
     return make_ppo(Plants(recipe), seed, net_arch=layers)
 
