@@ -24,7 +24,7 @@ SEED = SEEDS["data sets"].first  # seed of the first episode of each data set
 # Number of episodes on which learners are evaluated; no data set has one of these episodes.
 EVALUATION_EPISODES = 50
 # For each behaviour, the controllers that control the plant in a data set. Several controllers
-# take turns: each controls every n-th episode.
+# take turns: each of n controllers controls every n-th episode.
 BEHAVIOURS = {
     "pi": ("pi",),
     "smith": ("smith",),
@@ -84,7 +84,7 @@ def arguments_of(preset: str) -> dict[str, Any]:
         "reward": "absolute",  # with `error_scale`, the reward is -|e|, degC
         "error_scale": 1.0,
         # The observation holds more past actions than the delay in samples, and so determines
-        # the next output apart from noise.
+        # the next output apart from noise, load and drift.
         "action_window": 20,
     }
 
@@ -143,7 +143,7 @@ def write(root: Path, dataset_id: str, episodes: int) -> str:
     try:
         # Minari does not list the contents of hidden folders.
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as folder:
-            # HDF5 crashes if the disk is full. To raise an OSError instead, a file as large as
+            # HDF5 crashes if the disk is full. To raise an OSError instead, a file larger than
             # the data set is written first and then removed.
             room = Path(folder, "room")
             room.write_bytes(bytes(1_000_000 + episodes * 250_000))

@@ -26,12 +26,12 @@ from mptc_gym.vector_env import MiddlePointVectorEnv
 
 Values = NDArray[np.float64]  # one number for each episode, shape (episodes,)
 
-# Seed of the first episode of a published score; episode i has `SEED + i`. The seed is
-# arbitrary, but never changes, so that published scores remain comparable.
+# Seed of the first episode, unless the caller asks for another seed; episode i has `SEED + i`.
+# The seed is arbitrary, but never changes, so that published scores remain comparable.
 SEED: Final = 7_000_000
-EPISODES: Final = 100  # episodes of a published score
-# Seed of the first validation episode. Validation episodes serve to choose among policies, and
-# no published score uses a validation episode.
+EPISODES: Final = 100  # episodes of a score, unless the caller asks for another number
+# Seed of the first validation episode. Validation episodes serve to choose among policies, so a
+# policy that is chosen on validation episodes is not chosen on the default episodes of a score.
 VALIDATION_SEED: Final = 5_000_000
 VALIDATION_EPISODES: Final = 200  # validation episodes with a known least possible error
 SAMPLES: Final = 1200  # samples of an episode, unless the environment ends the episode earlier
@@ -51,25 +51,26 @@ class Evaluation:
     Attributes
     ----------
     env : str
-        Id of the environment, or the class name of an environment that has no id.
+        Id of the environment, with the names of plant arguments that differ from those of the
+        id, or the class name of an environment that has no id.
     mean_error, travel : float
         Mean absolute error, degC, and valve travel, t/h, each averaged over the episodes.
     errors : ndarray, shape (episodes,)
-        Mean absolute error of each episode, degC: the mean of |e(k)| over the samples k = 1 to
-        N, where e(k) is the deviation of the temperature from the set point.
+        Mean absolute error of each episode, degC: the mean of |e(k)| over all samples k of the
+        episode after k = 0, where e(k) is the set point minus the temperature.
     travels : ndarray, shape (episodes,)
         Valve travel of each episode, t/h: the sum of the absolute changes of the flow that the
         valve applies.
     seeds : range
         Seeds of the episodes.
     note : str
-        Reason why the score is missing or why the valve never moved, with advice; otherwise "".
+        Reasons why the score is missing and why the valve never moved; otherwise "".
     least_possible : float or None
         Least possible mean error, degC, averaged over the episodes: a lower bound for random
-        and constant set points, otherwise the lowest mean error if set-point changes come as a
-        surprise. If the package does not know the least possible error, the attributes
-        `least_possible`, `multiple`, `score`, `interval`, `least` and `scores` are None, and
-        the attribute `note` says why.
+        and constant set points, otherwise the lowest mean error if the plant has settled before
+        each set-point change and the change comes as a surprise. If the package does not know
+        the least possible error, the attributes `least_possible`, `multiple`, `score`,
+        `interval`, `least` and `scores` are None, and the attribute `note` says why.
     multiple : float or None
         The mean error of the policy divided by the least possible mean error.
     score : float or None
@@ -143,8 +144,9 @@ def evaluate(
         - An object with a method `act`, such as a controller in `agents`. `act` takes
           observations, shape (n, size), and returns actions, shape (n, 1), in NumPy arrays.
 
-        - A `torch.nn.Module`, or a method of a module. A module receives observations as a
-          tensor of the type of the module's weights, in evaluation mode and without gradients.
+        - A `torch.nn.Module` without the methods `predict` and `act`, or another method of a
+          module, such as `module.forward`. The observations are a tensor of the type of the
+          module's weights. The module is in evaluation mode and computes no gradients.
 
         - Any other function that takes observations, shape (n, size), and returns actions,
           shape (n, 1), in NumPy arrays.
@@ -159,17 +161,18 @@ def evaluate(
         of Gymnasium or `VecEnv` of Stable-Baselines3, such as `model.get_env()`. If `env` holds
         fewer environments than `episodes`, each environment runs several episodes in turn.
 
-        Environments that cannot be copied, because they run in other processes or show a
-        window, are used directly, and are reset after the evaluation. A copied environment and
-        the original environment share files that are opened by name, global random number
-        generators, and the global and closure variables of functions.
+        Environments that cannot be copied, for example environments that run in other processes
+        or show a window, are used directly, and are reset after the evaluation. A copied
+        environment and the original environment share files that are opened by name, global
+        random number generators, and the global and closure variables of functions.
     episodes
         Number of episodes, at least 2. An episode has 1,200 samples, or fewer if the
         environment ends the episode earlier.
     seed
-        Seed of the first episode; episode i has the seed `seed + i`. The default seed is the
-        seed of all published scores. To choose among policies, pass `VALIDATION_SEED` of
-        `mptc_gym.evaluation`: no published score uses the 200 seeds from `VALIDATION_SEED` on.
+        Seed of the first episode; episode i has the seed `seed + i`. Use the default seed for a
+        score to publish. To choose among policies, pass `VALIDATION_SEED` of
+        `mptc_gym.evaluation`: the 200 seeds from `VALIDATION_SEED` on are for this choice, and
+        differ from the default seeds.
     **arguments
         Further arguments of the environment, as in `gymnasium.make`, if `env` is an id or a
         spec.
@@ -343,7 +346,7 @@ def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
             f"bounds are kept for episodes of {SAMPLES:,} samples, not of {length:,}: leave "
             "max_episode_steps as it is",
         )
-    if len(least_by_seed[SEED]) == 1:  # one bound for all seeds: only noise and load are random
+    if len(least_by_seed[SEED]) == 1:  # one value for all seeds: only noise and load are random
         return Bound(np.repeat(least_by_seed[SEED], len(seeds)))
     seeds_with_bounds = []
     for first, least in least_by_seed.items():
@@ -377,7 +380,7 @@ def _read_bounds() -> dict[Parameters, dict[int, Values]]:
 
 
 def case_of(parameters: Parameters) -> Parameters:
-    """Return `parameters` with the default observation windows and the default reward.
+    """Return `parameters` with the default arguments of the observation and the reward.
 
     Plants for which `case_of` returns equal arguments have the same least possible error.
     """

@@ -24,13 +24,13 @@ from mptc_gym.torch_env import MiddlePointTorchEnv
 
 FILE = Path("recurrent.pt")  # the file of the trained network
 SAMPLES = 1200  # number of samples in an episode
-# Number of samples in a segment, over which gradients are computed. The delay is at most 25
-# samples, so a segment contains most of the effect of a flow on the output.
+# Number of samples in a segment, over which gradients are computed. The delay is at most 24
+# samples, so a segment contains most of the effect of most flows on the output.
 SEGMENT = 150
 TEMPERATURE = 5.0  # scale of temperatures, degC, for network inputs of order 1
 LARGEST_MOVE = 0.4  # largest change of the action per sample; actions are in [-1, 1]
-# Number of past actions among the network's inputs. With the longest delay, these are all flows
-# that have not yet affected the output.
+# Number of past actions among the network's inputs. Even with the longest delay, these actions
+# include all flows that have not yet affected the output.
 MEMORY = 26
 NODES = 64  # nodes of the recurrent unit
 

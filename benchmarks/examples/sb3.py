@@ -81,7 +81,7 @@ def inputs(observations: Tensor, windows: Mapping[str, int]) -> Tensor:
 
 
 def changes(window: Tensor, short_stretches: int) -> Tensor:
-    """Return changes of a signal from stretch to stretch of samples, (n, stretches - 1).
+    """Return changes of a signal between stretches of samples, shape (n, stretches - 1).
 
     `window` holds past samples of the signal for n plants, newest first, shape (n, length). A
     change is the mean over a stretch of samples minus the mean over the next older stretch. The
@@ -154,7 +154,7 @@ def make_ppo(plants: VecEnv, seed: int, **policy_arguments: Any) -> PPO:
         "MlpPolicy",
         plants,
         # The learning rate falls with the share of the training that remains. At the last
-        # update, this share is 0, and the lower bound keeps the learning rate above 0.
+        # update, this share is 0 or below, and the limit 0.05 keeps the learning rate above 0.
         learning_rate=lambda remaining: 2e-3 * max(remaining, 0.05),
         rollout_buffer_class=GroupBuffer,
         policy_kwargs=policy_arguments,

@@ -31,8 +31,8 @@ STEADY_ACTION = -0.1465
 def act(network: nn.Module, observations: Tensor) -> Tensor:
     """Return the actions of the policy for n plants, shape (n, 1).
 
-    An action is the network's output plus the constant action that keeps the temperature at the
-    set point in steady state. All inputs of the network are 0 if the plant has been in steady
+    An action is the network's output plus the action that keeps the temperature at the set
+    point in steady state. All inputs of the network are 0 if the plant has been in steady
     state at the set point for 24 samples.
 
     Parameters

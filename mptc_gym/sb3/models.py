@@ -200,10 +200,10 @@ class ScoreCallback(BaseCallback):
     """Score a policy at intervals during the policy's training, and save the best policy.
 
     The policy is scored without exploration. The seeds of the scored episodes begin at
-    `VALIDATION_SEED` of `mptc_gym.evaluation`, and no published score uses these seeds.
-    `MiddlePoint-v0` has the same episode for all seeds, so choose a set point of your own for
-    scores in `MiddlePoint-v0`, such as `setpoint_period=500`. The model's logger records the
-    mean absolute error, degC, as `score/mean_error`. If the least possible error is known, the
+    `VALIDATION_SEED` of `mptc_gym.evaluation`, and differ from the default seeds of `evaluate`.
+    `MiddlePoint-v0` has the same episode for all seeds. To choose a policy in another episode,
+    pass another set point, such as `setpoint_period=500`. The model's logger records the mean
+    absolute error, degC, as `score/mean_error`. If the least possible error is known, the
     logger records the score as `score/score`.
 
     Parameters
@@ -214,8 +214,8 @@ class ScoreCallback(BaseCallback):
         the observation windows and the wrappers of the training. If `env` is in a
         `VecNormalize`, each score uses the training's present normalisation statistics.
     every
-        Number of training samples between two scores, summed over all plants. The policy is
-        scored once more at the end of the training.
+        Least number of training samples between two scores, summed over all plants. The policy
+        is also scored at the end of the training.
     episodes
         Number of episodes in which the policy is scored each time. If plants or set points are
         random, a score needs least possible errors, which are known for at most 200 episodes.
@@ -279,15 +279,16 @@ class ScoreCallback(BaseCallback):
     def _environment(self) -> tuple[Any, dict[str, Any]]:
         """Return an environment, and arguments of the environment, to pass to `evaluate`.
 
-        If `env` is in a `VecNormalize`, the returned environment is a copy of `env` with the
-        training's present normalisation statistics.
+        If `env` is an environment, a copy of `env` is returned, in which each `VecNormalize`
+        has the training's present normalisation statistics.
         """
         if isinstance(self._env, str | EnvSpec):
             return spec_of(self.model, self._env, **self._arguments), {}
         if not is_environment(self._env):
             return self._env, self._arguments
         env = Copy(self._env).env
-        # If one environment has more VecNormalize wrappers, `zip` leaves the last ones out.
+        # If `env` and the training have unequal numbers of VecNormalize wrappers, `zip` leaves
+        # out the surplus, innermost wrappers.
         pairs = zip(_normalisers(env), _normalisers(self.training_env), strict=False)
         for of_copy, of_training in pairs:
             of_copy.ret_rms = copy.deepcopy(of_training.ret_rms)

@@ -22,9 +22,10 @@ class GymnasiumVecEnv(VecEnv):
     """A `VecEnv` of Stable-Baselines3 that steps vector environments of Gymnasium (batches).
 
     All environments of a batch are stepped at once, whereas a `DummyVecEnv` steps one
-    environment after another. All methods return bit for bit what a `DummyVecEnv` returns for
-    the same environments in `Monitor` wrappers, except for the infos of `step`. To save time,
-    `step` returns an empty info for each environment whose episode has not ended.
+    environment after another. `reset` and `step` return bit for bit what a `DummyVecEnv`
+    returns for the same environments and seeds in `Monitor` wrappers, except for the infos of
+    `step`. To save time, `step` returns an empty info for each environment whose episode has
+    not ended. `env_method` and `set_attr` raise an error.
 
     Parameters
     ----------
@@ -186,14 +187,15 @@ class GymnasiumVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[Any], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return False for each environment in `indices`: no environment has a wrapper."""
+        """Return False for each environment in `indices`: wrappers are around batches only."""
         return [False for _ in self._get_indices(indices)]
 
 
 def _joined(infos: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[Any]]:
     """Return the infos of all vector environments by name, in arrays of shape (num_envs,).
 
-    An info is left out if any of the vector environments lacks this info.
+    An info is left out if any of the vector environments lacks this info, or if the info is not
+    an array, as `final_info`.
     """
     common_names = set(infos[0]).intersection(*infos[1:])
     joined = {}
@@ -212,7 +214,7 @@ def _infos_of_one(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
     infos_of_one = {}
     for name, values in infos.items():
         mask = infos.get(f"_{name}")
-        # "final_obs" and "final_info" belong to the batch, not to an environment.
+        # "final_obs" and "final_info" belong to the episode that has ended, not to the new one.
         if mask is not None and mask[row] and not name.startswith("final_"):
             value = values[row]
             infos_of_one[name] = value.item() if isinstance(value, np.generic) else value
@@ -243,7 +245,8 @@ def make_vec_env(
         the seed is random.
     group
         Number of successive plants that share a seed. Plants with the same seed have the same
-        noise, load and set points, and differ only in the random part of the policy's actions.
+        parameter values, noise, load and set points, and differ only in the random part of the
+        policy's actions.
     wrapper
         Arguments of an `IncrementalAction` that wraps the plants, or the class
         `IncrementalAction` for default arguments, or None for no wrapper. For any other

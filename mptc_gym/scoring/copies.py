@@ -34,7 +34,7 @@ _RECORDERS: Final = (
     "minari.DataCollector",
     f"{VEC_ENV}.VecVideoRecorder",
 )
-# Classes of the two ends of a pipe. Only Windows has the class `PipeConnection`.
+# Classes of the ends of a pipe to a process. Only Windows has the class `PipeConnection`.
 _PIPE_ENDS: Final[set[Any]] = {
     connection.Connection,
     getattr(connection, "PipeConnection", connection.Connection),
@@ -74,7 +74,10 @@ class Copy:
             self.env = self._copy(env)
 
     def _copy(self, layer: Any) -> Any:
-        """Return a copy of a wrapper or environment, or the original if it cannot be copied."""
+        """Return a copy of a wrapper or environment, or the original if it cannot be copied.
+
+        For a recorder (`_RECORDERS`), a copy of the environment in the recorder is returned.
+        """
         if id(layer) in self._copies:
             return self._copies[id(layer)]
         copies_of_inner = [self._copy(inner) for inner in inner_environments(layer)]

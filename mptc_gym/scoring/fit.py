@@ -1,8 +1,8 @@
 """Raise an error if a policy was trained or made for other environments.
 
 A model of Stable-Baselines3 stores the spaces of the training environments, and a controller in
-`agents` stores the actuator's parameters. A policy that is a plain function stores nothing that
-can be checked.
+`agents` stores the actuator's limits and the order of the observation. A policy that is a plain
+function stores nothing that can be checked.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ def _check_training(model: Any, plants: Plants) -> None:
     only if the model still has its training environments.
     """
     training = getattr(model, "env", None)
-    # The list is empty if the training environments ran in processes that are now closed.
+    # `training_groups` is empty, for example, if the training environments ran in processes
+    # that are now closed.
     training_groups = plant_groups(training) if is_environment(training) else []
     if training_groups:
         groups = plant_groups(plants)

@@ -29,7 +29,7 @@ from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.policies import form_of
 from mptc_gym.scoring.rollout import infos_in_arrays
 
-# Class of the attribute `policy` of a Stable-Baselines3 model.
+# Base class of the attribute `policy` of a Stable-Baselines3 model.
 _POLICY_NETWORK: Final = "stable_baselines3.common.policies.BaseModel"
 
 # A vector environment of Gymnasium. The annotation is not `VectorEnv`, because the annotated
@@ -104,7 +104,7 @@ def _sync_vector_env(environments: list[Env]) -> Plants:
 
 
 def _as_vector(env: Any) -> Plants:
-    """Return a single environment, or a `VecEnv`, as a vector environment of Gymnasium."""
+    """Return an environment of any kind as a vector environment of Gymnasium."""
     if isinstance(env, VectorEnv):
         return env
     if not isinstance(env, gymnasium.Env):

@@ -145,8 +145,8 @@ def _act_in_evaluation_mode(act: Act, module: Any) -> Act:
     """Return a function that calls `act` while a PyTorch module is in evaluation mode.
 
     PyTorch computes no gradients during a call of `act`. After each call of `act`, each part of
-    the module returns to the part's previous mode. The actions are returned as a NumPy array,
-    even if `act` returns a tensor.
+    the module returns to the part's previous mode. If `act` returns a tensor, the returned
+    function returns a NumPy array.
     """
     torch: Any = sys.modules["torch"]
     parts = [part for part in module.modules() if hasattr(part, "training")]

@@ -25,7 +25,9 @@ Infos = Mapping[str, Any]  # infos of n plants by name, in arrays of shape (n,)
 class Sample(NamedTuple):
     """Observations and infos of n plants at one sample k."""
 
-    observations: Any  # one row for each plant, as the policy receives them
+    # One row for each plant. At the end of an episode, some environments return the first
+    # observation of the next episode.
+    observations: Any
     infos: Infos  # infos of sample k; at the end of an episode, not those of the next episode
     ended: NDArray[np.bool_]  # whether this sample is the last of an episode, shape (n,)
 
@@ -57,8 +59,8 @@ def rollout(env: Any, act: Act, samples: int, seeds: list[int]) -> Iterator[Samp
 def infos_in_arrays(infos: Any) -> Infos:
     """Return the infos of n plants as a dict from names to arrays of shape (n,).
 
-    A dict `infos` is returned unchanged. A list `infos` holds a dict for each plant; only
-    numbers are taken from the dicts, and a number that a plant lacks becomes NaN.
+    A dict `infos` is returned unchanged. A list `infos` holds a dict for each plant; only names
+    that have a number in the first dict are kept, and a number that a plant lacks becomes NaN.
     """
     if isinstance(infos, Mapping):
         return infos
@@ -124,8 +126,8 @@ def replayed(
 def _compare_infos(infos: Infos, expected: Infos, k: int) -> None:
     """Raise a ValueError if infos of n plants at sample k differ from the expected infos."""
     names = [name for name in expected if not name.startswith("_")]  # "_name" is a mask
-    # Compare the last names first: the last infos are the plant parameters that are drawn for
-    # the episode, and a difference in a parameter explains differences in other infos.
+    # Compare the last names first: the last infos of a step are the noise, the load and the
+    # drift factors, in which a difference explains differences in other infos.
     for name in reversed(names):
         differences = np.abs(infos.get(name, np.nan) - expected[name])
         if not (differences <= _TOLERANCE * (1.0 + np.abs(expected[name]))).all():

@@ -43,7 +43,8 @@ from mptc_gym.torch_env.plant import TorchPlants
 from mptc_gym.torch_env.signals import make_signals
 from mptc_gym.torch_env.window import Window
 
-# Maximum number of values in a block of a signal on a CPU: 512 KiB of float32 fit in the cache.
+# Number of values in a block of a signal on a CPU, at most, if a block has several samples:
+# 512 KiB of float32 fit in the cache.
 _NUMBERS_IN_CACHE = 1 << 17
 
 
@@ -129,14 +130,14 @@ class MiddlePointTorchEnv(BatchEnv):
     gradient graph for truncated backpropagation. An action affects the temperature after
     `delay` + 1 samples, so fewer samples than that between two calls of `detach` give no
     gradient through the plant. If `differentiable` is False, the environment keeps no gradient
-    graph. A copy or a pickle of the environment, even in the middle of an episode, has no
-    gradient graph of earlier actions.
+    graph of actions. A copy or a pickle of the environment, even in the middle of an episode,
+    has no gradient graph of earlier actions.
 
-    **Waiting.** `step` never waits for the device to finish its computations. As a check of the
-    actions would wait for the device, `step` raises a ValueError for actions that are not
-    finite only on a CPU. On devices other than a CPU, a plant whose action is not finite may
-    have the temperature NaN until the plant is reset. `reset` may wait for the device to finish
-    its computations.
+    **Waiting.** If the actions are a tensor on the device, `step` does not wait for the device
+    to finish its computations. As a check of the actions would wait for the device, `step`
+    raises a ValueError for actions that are not finite only on a CPU. On devices other than a
+    CPU, a plant whose action is not finite may have the temperature NaN until the plant is
+    reset. `reset` may wait for the device to finish its computations.
 
     **Memory.** The caller may keep or overwrite the tensors that `step` returns, except the
     masks and the drift factors in the infos, which several steps may share. Tensors that
@@ -175,7 +176,8 @@ class MiddlePointTorchEnv(BatchEnv):
         self.dtype = dtype
         self.differentiable = differentiable
         self.checks_actions = self.device.type == "cpu"
-        self._action = self._zeros  # the actions of the last step, shape (n,)
+        # The actions of the last step, shape (n,), kept only if the reward has a cost of moves.
+        self._action = self._zeros
 
         self._episodes = Episodes(self.parameters, self._zeros)
         self._plants = TorchPlants(self.parameters, self._episodes)
@@ -184,9 +186,10 @@ class MiddlePointTorchEnv(BatchEnv):
         self._own_signals = make_signals(self.parameters, self._episodes)
         self._signals = self._own_signals  # own or external signals, by name
         self._external: dict[str, ExternalValues] = {}  # external signals and parameter values
-        # The last k for which all external signals have a value; None without such signals.
+        # The last sample number k for which all external signals have a value; None if there
+        # are no external signals.
         self._last_sample: int | None = None
-        # On a CPU, a block of samples must fit in the processor's cache. On other devices,
+        # On a CPU, a block of samples should fit in the processor's cache. On other devices,
         # blocks are as long as possible, since every call of PyTorch takes long.
         self._most_samples = min(MOST_BLOCK_SAMPLES, self._plants.most_samples)
         if self.device.type == "cpu":
@@ -213,9 +216,9 @@ class MiddlePointTorchEnv(BatchEnv):
     def detach(self) -> None:
         """Cut the gradient graph to earlier actions, for truncated backpropagation.
 
-        The tensors that later steps return depend only on actions after the call of `detach`.
-        The tensors that earlier steps returned remain in the gradient graph, so detach the
-        latest observation as well before the policy uses that observation.
+        The tensors that later steps return have gradients only with respect to actions after
+        the call of `detach`. The tensors that earlier steps returned remain in the gradient
+        graph, so detach the latest observation as well before the policy uses that observation.
         """
         self._plants.detach()
         self._window.detach()
@@ -242,7 +245,7 @@ class MiddlePointTorchEnv(BatchEnv):
         return observations, rewards, terminations, truncations, infos
 
     def _compute_block(self) -> None:
-        """Compute and store the results and the observations of a block of future steps.
+        """Compute and store the results and observations of the present and of future steps.
 
         An action affects the temperature only after the delay, so past actions determine the
         temperatures of a block of successive samples.
@@ -380,7 +383,7 @@ class MiddlePointTorchEnv(BatchEnv):
         """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended.
 
         A ValueError is raised if the actions do not have the shape (num_envs, 1), if an action
-        is not finite (on the CPU), or if an external signal has ended.
+        is not finite and `checks_actions` is True, or if an external signal has ended.
         """
         column = actions
         if not (isinstance(actions, Tensor) and actions.dtype is self.dtype):
@@ -437,7 +440,8 @@ def make_vec(env: str | EnvSpec, num_envs: int, **arguments: Any) -> MiddlePoint
     Raises
     ------
     ValueError
-        If `env` is unknown or is not a `MiddlePointEnv`, or if an argument is out of range.
+        If `env` is unknown, is not a `MiddlePointEnv` or has wrappers, or if an argument is out
+        of range.
     """
     single_arguments = {name: arguments[name] for name in ARGUMENTS if name in arguments}
     if "max_episode_steps" in arguments:

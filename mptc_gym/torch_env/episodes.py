@@ -1,8 +1,9 @@
 """Keep start times, parameter values and external signals of many plants in PyTorch.
 
-Times are counted in steps of the environment, which computes a block of successive samples in
-advance. If some plants are reset before `step` has returned all samples of a block, the unused
-samples at the end of the block are dropped, and computed again for all plants.
+Times are counted in steps of the environment, except steps that only reset plants. The
+environment computes a block of successive samples in advance. If some plants are reset before
+`step` has returned all samples of a block, the unused samples at the end of the block are
+dropped, and computed again for all plants.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +47,7 @@ class Block(NamedTuple):
     first_time: int  # time of row 0, in steps of the environment
     samples: int  # number of rows
     starts: Tensor | int  # time at k = 0 of each plant, shape (n,), or one time for all plants
-    due_rows: list[int]  # rows at which the load or the dynamics of some plant change
+    due_rows: list[int]  # rows at which the load or dynamics of some plant can change
 
     def age(self, row: int) -> Tensor | int:
         """Return the sample number k at a row of the block, shape (n,), or one number."""
@@ -162,7 +163,7 @@ class Episodes:
         restart
             Plants whose episode begins.
         time
-            Present time: the number of steps of the environment so far.
+            Present time, in steps of the environment.
         starts
             Start time of each plant's episode, in steps of the environment, shape (n,): for
             plants whose episode begins, the start time is `time`.

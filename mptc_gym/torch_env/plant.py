@@ -135,7 +135,7 @@ class TorchPlants:
         """Compute the coefficients of equation (28) of the paper at sample k = `age`.
 
         The coefficients multiply past temperatures, past flows and the load in equation (28).
-        If gain and time constant drift, the coefficients change at sample numbers that are
+        If gain or time constant drifts, the coefficients change at sample numbers that are
         multiples of `DRIFT_INTERVAL`. `age` is the sample number k of each plant, shape (n,),
         or one number for all plants.
         """
@@ -230,7 +230,7 @@ class TorchPlants:
         the paper, applied flow u_a and delay d. `samples` is the number of samples in the
         block.
         """
-        # One delayed flow for each sample, and before them the flows for further terms of B.
+        # One delayed flow for each sample, and earlier flows for the further terms of B.
         rows = samples + len(self._beta) - 1
         if self._delayed_at is None:
             delayed_flows = torch.stack([*islice(self._flows, rows)])

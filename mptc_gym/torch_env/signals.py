@@ -207,7 +207,7 @@ class Disturbance:
         # +-1, and so gives the new level.
         position = step_draws * (interval / LOAD_INTERVAL)
         jumps = position.abs() <= 1.0
-        # A step of the walk is uniform within +-h and so has the variance h^2 / 3.
+        # A step of the walk is uniform within +-`width`, and so has the variance width^2 / 3.
         width = (3.0 * LOAD_INTERVAL * numbers["disturbance_walk_variance"]) ** 0.5
         next_walk = walk + walk_draws * width
         if isinstance(age, Tensor):  # the episodes of the plants began at different times
@@ -222,7 +222,7 @@ Signal = Noise | RandomSetPoint | RepeatedSetPoint | Disturbance | ExternalValue
 
 
 def make_signals(parameters: Parameters, episodes: Episodes) -> dict[str, Signal]:
-    """Return the signals of an environment by name, except signals that are always 0."""
+    """Return the signals of an environment by name, without loads and noises always at 0."""
     levels = SetPointLevels(parameters)
     signals: dict[str, Signal] = {}
     if levels.random:

@@ -44,7 +44,7 @@ class Window:
         self._actions = torch.where(restart.mask, rest_action.clamp(-1.0, 1.0), self._actions)
 
     def extend(self, *blocks: Tensor) -> None:
-        """Append successive samples of set points, errors and outputs to the stored samples.
+        """Store successive set points, errors and outputs, and compute the observations.
 
         `blocks` holds three tensors of shape (samples, n), degC: set points, errors and
         outputs.
@@ -81,8 +81,8 @@ class Window:
     def _stack(self, samples: int, first_place: int) -> list[Tensor]:
         """Return observations at successive samples, without actions, each of shape (size, n).
 
-        The first of the `samples` observations begins at the index `first_place` of the stored
-        set points, errors and outputs.
+        In the stored set points, errors and outputs, the oldest elements of the first
+        observation have the index `first_place`.
         """
         newest_first: list[Tensor] = []  # the elements of all observations, shape (n,) each
         for place in range(first_place, first_place + samples):
