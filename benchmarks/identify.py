@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from benchmarks.loop.identification import Fit, Log
 
 FEWEST_ROWS = 100  # smallest number of rows in a log, so that the fit can find the delay
-MOST_ROWS = 10_000  # largest number of rows in a fit, to limit time and memory
+# Largest number of rows in a fit, to limit time and memory. Of a longer log, only the last rows
+# are fitted.
+MOST_ROWS = 10_000
 LONGEST_GAP = 20  # longest time between two rows, in sampling intervals
 MOST_MISSING = 0.2  # largest share of the values in a column that may be missing
 # Matches one to three digits and then groups of three digits, each behind a point or a comma.
@@ -61,9 +63,11 @@ class Options:
     operating_flow: Finite | None = None
     """Flow at the operating point, the centre of the dead zone (default: the fit finds it)."""
     u_min: Finite | None = None
-    """Smallest flow minus the operating flow (default: the smallest flow of the log)."""
+    """Smallest possible flow, minus the operating flow (default: the smallest flow of the log,
+    minus the operating flow)."""
     u_max: Finite | None = None
-    """Largest flow minus the operating flow (default: the largest flow of the log)."""
+    """Largest possible flow, minus the operating flow (default: the largest flow of the log,
+    minus the operating flow)."""
 
 
 def work(options: Options) -> str:
@@ -109,8 +113,10 @@ def work(options: Options) -> str:
 def read_log(options: Options) -> Log:
     """Return the log in the CSV file `options.log`, with the missing values filled in.
 
+    Of a log with more than `MOST_ROWS` samples, only the last `MOST_ROWS` samples are returned.
     A missing temperature is interpolated between the rows before and after. A missing flow or
-    disturbance gets the value of the row before. A `UsageError` says why a log cannot be used.
+    disturbance gets the latest earlier value or, before the first value of its column, the
+    first value. A `UsageError` says why a log cannot be used.
     """
     import pandas as pd  # imported here, as it is slow
 
@@ -164,7 +170,7 @@ def read_table(path: Path) -> tuple[pd.DataFrame, str]:
 
     The values of the table are strings, and NaN for empty cells. The separator is a semicolon
     or a tab if the first line of the file contains one, and otherwise a comma. A `UsageError`
-    is raised if the file is not a table or has fewer than `FEWEST_ROWS` rows.
+    is raised if the file cannot be read, is not a table, or has fewer than `FEWEST_ROWS` rows.
     """
     import pandas as pd
 
@@ -207,8 +213,9 @@ def decoded(content: bytes) -> str:
 def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
     """Return the numbers in a column of strings, with NaN for empty cells.
 
-    A `UsageError` names the first line whose text is not a number, or may have separators of
-    thousands, such as 1,480. `separator` is the character between the columns of the CSV file.
+    A `UsageError` names the first line whose text is not a number of a magnitude below 1e30. A
+    `UsageError` is also raised if the points or commas in the column probably separate
+    thousands, as in 1,480. `separator` is the character between the columns of the CSV file.
     """
     import pandas as pd
 
@@ -219,8 +226,9 @@ def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
     marked = column[has_mark]
     looks_like_thousands = bool(has_mark.any() and marked.str.fullmatch(THOUSANDS).all())
     if separator != ",":
-        # A point or a comma is often a decimal mark in such a file. It separates thousands if
-        # this makes the marked numbers continue the range of the others: 850, 900, 1.100.
+        # If semicolons or tabs separate the columns, a point or a comma in a number is often a
+        # decimal mark. The points or commas probably separate thousands if the numbers with
+        # points or commas then continue the range of all other numbers: 850, 900, 1.100.
         sizes = numbers.abs()
         smallest_with_thousands = 1000.0 * sizes[has_mark].min()
         looks_like_thousands &= bool(smallest_with_thousands < 10.0 * sizes[~has_mark].max())
@@ -239,9 +247,10 @@ def read_numbers(column: pd.Series[str], separator: str) -> pd.Series[float]:
 def read_times(column: pd.Series[str], separator: str) -> NDArray[np.float64]:
     """Return the times of a column of numbers (s) or dates, in seconds, shape (rows,).
 
-    Dates are converted to seconds since the first row. A `UsageError` names the first line
-    whose text is neither a number nor a date. `separator` is the character between the columns
-    of the CSV file.
+    Dates are converted to seconds since the first row. If more than half of the cells are
+    numbers, all cells must be numbers; otherwise, all cells must be dates. A `UsageError` names
+    the first line whose cell is empty or has another text. `separator` is the character between
+    the columns of the CSV file.
     """
     import pandas as pd
 
@@ -279,7 +288,8 @@ def sample_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float
 
     A gap in the rows is a gap in the sample numbers. `times` has the time of each row, s, shape
     (rows,). A `UsageError` is raised if the times do not increase, if a row is more than 0.4
-    sampling intervals early or late, or if 20 or more rows in succession are missing.
+    sampling intervals early or late, if two rows belong to one sample, or if two successive
+    rows are more than `LONGEST_GAP` sampling intervals apart.
     """
     steps = np.diff(times)
     is_usual = np.abs(steps / np.median(steps) - 1.0) < 0.5
@@ -364,10 +374,11 @@ def is_white(errors: NDArray[np.float64]) -> bool:
     """Return whether successive prediction errors, shape (blocks,), look like white noise.
 
     The result is true if at least three quarters of the autocorrelations of the errors, at lags
-    from 1 to 30 blocks, are small enough to be due to chance.
+    from 1 to 30 blocks, are small enough to be due to chance, or at most 0.1 in magnitude.
     """
     correlations = np.correlate(errors, errors, "full")[len(errors) :][:30] / (errors @ errors)
-    # By chance, about 1 % of the autocorrelations of n errors are larger than 2.5 / sqrt(n).
+    # By chance, the magnitudes of about 1 % of the autocorrelations of n errors are larger than
+    # 2.5 / sqrt(n).
     # Autocorrelations up to 0.1 do no harm, even if they are not due to chance.
     is_large = np.abs(correlations) > max(0.1, 2.5 / np.sqrt(len(errors)))
     return bool(np.mean(is_large) <= 0.25)
@@ -404,9 +415,9 @@ def doubts_about_sensor(temperature: NDArray[np.float64]) -> list[str]:
 def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
     """Return the arguments of the environment `MiddlePoint-v0` for the plant of a fit.
 
-    All flows in the result are deviations from the centre of the dead zone, t/h. If the plant
-    cannot follow the environment's default set point, the result has a set point with a smaller
-    amplitude or a longer period.
+    The limits of the flow in the result are deviations from the centre of the dead zone, t/h.
+    If the plant cannot follow the environment's default set point, the result has a set point
+    with a smaller amplitude, a longer period, or both.
     """
     from benchmarks.loop.identification import polynomials
 
@@ -417,8 +428,8 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
     u_min = float(flow.min()) if options.u_min is None else options.u_min
     u_max = float(flow.max()) if options.u_max is None else options.u_max
     smaller_limit, larger_limit = sorted([-u_min, u_max])
-    # The set point changes its sign, so the limit closer to 0 decides how large it can be. But
-    # a limit that is very close to 0 would make the set point useless.
+    # The set point changes its sign, so the limit closer to 0 decides how large the set point
+    # can be. But with a limit that is very close to 0, the set point would hardly change.
     usable_limit = larger_limit if is_one_sided(u_min, u_max) else smaller_limit
     gain = abs(fit.unknowns.gain)
     settling = delay + round(4.0 * (fit.unknowns.slow + fit.unknowns.fast))  # samples
@@ -439,7 +450,10 @@ def plant_arguments(fit: Fit, options: Options) -> dict[str, Any]:
 
 
 def is_one_sided(u_min: float, u_max: float) -> bool:
-    """Return whether nearly all flows from `u_min` to `u_max`, t/h, have the same sign."""
+    """Return whether one limit of the flow is much closer to 0 than the other limit.
+
+    The limits `u_min` and `u_max`, t/h, are deviations from the operating flow.
+    """
     return min(-u_min, u_max) < 0.2 * max(-u_min, u_max)
 
 
@@ -454,8 +468,8 @@ def argument_ranges(
     limits = intervals[["low", "high"]].T
     largest_flow = max(-arguments["u_min"], arguments["u_max"])
     gain_factors = limits.gain / intervals.value["gain"]
-    # The environment divides 1 - p, with the pole p of the plant, by the time constant factor.
-    # Time constant factors must be larger than 1 - p.
+    # The environment divides 1 - p, where p is the slowest pole of the plant, by the time
+    # constant factor, which must be at least 1 - p.
     rates = 1.0 - np.exp(-arguments["sampling_interval"] / intervals.loc["time_constant"])
     lag_factors = np.clip(
         rates["value"] / rates[["low", "high"]], 1.000001 * rates["value"], 10.0

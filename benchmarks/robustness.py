@@ -110,8 +110,8 @@ def run_rule(name: str, sensitivity: float, runs: int) -> list[dict[str, Any]]:
 
         - `agent`: the name of the controller;
         - `Ms`: the maximum sensitivity;
-        - `closed_loop_time_constant` or `filter_time_constant`: the time constant of the
-          controller that the tuning rule chooses, s;
+        - `closed_loop_time_constant` or `filter_time_constant`: the time constant of the tuning
+          rule, chosen such that the loop has the maximum sensitivity `sensitivity`, s;
         - `shortest_delay` and `longest_delay`: the shortest and the longest delay with which
           the loop is stable, samples;
         - `case`: the name of the case;

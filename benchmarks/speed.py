@@ -36,7 +36,8 @@ class Options:
     """Compare the steps a second of the environments with those of Gymnasium's CartPole.
 
     In each round, all environments are timed once. The printed ratio is the median, over all
-    rounds, of the speed divided by the speed of CartPole in the same round.
+    rounds, of the speed divided by the speed of CartPole in the same round. With --device, the
+    ratio is that to the speed of the paper's plant in PyTorch.
     """
 
     rounds: Runs = 15
@@ -62,9 +63,10 @@ def work(options: Options) -> str:
 def make_environments(n: int, device: str | None) -> dict[str, Any]:
     """Return the environments to measure, each with n plants, by their names in the table.
 
-    If `device` is None, the environments are CartPole, the plants in NumPy and, if PyTorch is
-    installed and n is above 1, the plants in PyTorch on the CPU. If `device` is the name of a
-    device, such as "cuda", the environments are the plants in PyTorch on this device.
+    If `n` is 1, the environments are CartPole and the paper's plant. If `device` is None and n
+    is above 1, the environments are CartPole, the plants in NumPy and, if PyTorch is installed,
+    the plants in PyTorch on the CPU. If `device` is the name of a device, such as "cuda", and n
+    is above 1, the environments are the plants in PyTorch on this device.
     """
     if n == 1:
         return {name: gymnasium.make(name) for name in (REFERENCE, PLANT)}

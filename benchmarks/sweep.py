@@ -146,7 +146,7 @@ def work(options: Options) -> str:
                 write_csv(folder / "runs.csv", runs)
                 write_csv(folder / "summary.csv", summarise(runs))
                 report(runs, folder, Parameters(**nominal), provenance)
-    return f"The report, the data and a map are in {target}/"
+    return f"The report, the data and a picture are in {target}/"
 
 
 def design(options: Options, nominal: Arguments) -> list[Arguments]:

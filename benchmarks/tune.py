@@ -160,9 +160,10 @@ def work(options: Options) -> str:
 def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
     """Return a table of the scores of the best `FINALISTS` trials on new runs, best first.
 
-    New runs are necessary because the best result of many trials is partly luck. A row has the
-    numbers that `score` returns, and "in the search", the objective that the same gains had in
-    the search, degC. `trials` is the table that `search` returns.
+    New runs are necessary because the best result of many trials is partly luck. The gains of
+    the best trials are rounded to three digits before the new runs. A row has the numbers that
+    `score` returns for the new runs, and "in the search", the objective of the gains before
+    rounding in the search, degC. `trials` is the table that `search` returns.
     """
     import pandas as pd
 

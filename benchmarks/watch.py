@@ -36,7 +36,7 @@ class Options:
     constant, or the single case run if the plant has a set point (default: the first case)."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     seed: Seed = 0
-    """The seed of the noise and of the controller's initial weights."""
+    """The seed of all random numbers, such as noise and the controller's initial weights."""
     video: Path | None = None
     """The file of the film, which ends in .gif (default: a file in results/watch)."""
 
@@ -80,7 +80,7 @@ def write_film(path: Path, trajectory: Trajectory, parameters: Parameters, seed:
     from PIL.Image import Dither, Quantize
 
     pictures = list(frames(trajectory, parameters, seed))
-    # All pictures have the colours of the last picture, which shows the whole run.
+    # All pictures have the colours of the last picture, which shows nearly the whole run.
     palette = pictures[-1].quantize(COLOURS, Quantize.MAXCOVERAGE, kmeans=3)
     first, *rest = [
         picture.quantize(palette=palette, dither=Dither.NONE) for picture in pictures

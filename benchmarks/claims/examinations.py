@@ -209,8 +209,8 @@ def against_pi(batch: Batch, gains: PIGains) -> Findings:
 def wrong_direction(batch: Batch) -> Findings:
     """Measure when runs diverge if the networks assume the wrong sign of the plant's gain.
 
-    A run has diverged when the temperature exceeds 90 % of the largest steady temperature
-    change that the flow can cause within its limits.
+    A run has diverged when the magnitude of the temperature exceeds 90 % of the largest steady
+    temperature change that the flow can cause within its limits.
     """
     runs = batch.run(batch.networks(direction=1), 600, **CONSTANT_SETPOINT)
     plant = Parameters()
@@ -345,10 +345,10 @@ def direction_only(batch: Batch) -> Findings:
     """Measure how often the paper's network settles on plants with other parameter values.
 
     The steady flow for a set point of 5 degC lies beyond the actuator's limits if the gain is
-    below 0.74 of the paper's gain, and inside the dead zone if the gain is above 1.46 of the
-    paper's gain. Hence the network runs on all plants twice: with a set point of 5 degC, and
-    with a set point of 5 degC times the gain factor of the plant (its gain as a multiple of the
-    paper's gain).
+    below about 0.733 of the paper's gain, and inside the dead zone if the gain is above about
+    1.465 of the paper's gain. Hence the network runs on all plants twice: with a set point of
+    5 degC, and with a set point of 5 degC times the gain factor of the plant (the plant's gain
+    as a multiple of the paper's gain).
     """
     fixed = plants_that_settle(batch, gains=(0.75, 1.0, 1.25, 1.4), is_scaled=False)
     scaled = plants_that_settle(batch, gains=(0.7, 1.0, 1.25, 1.5), is_scaled=True)

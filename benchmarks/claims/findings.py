@@ -176,7 +176,7 @@ def _formatted(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _three_digits(value: float) -> str:
-    """Return a number as text with about three digits.
+    """Return a number as text: with three decimals below 10, one below 100, and otherwise none.
 
     The text of infinity is "never", since the time of an event that did not happen is infinite.
     The text of minus infinity, an unknown lower end of an interval, is "?".

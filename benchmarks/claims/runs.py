@@ -46,9 +46,12 @@ class Batch:
             Number of latest set points, and number of latest errors, that each network
             observes.
         in_proportion
-            Whether to divide the paper's learning rates by n if a network has n times the nodes
-            or inputs of the paper's network. With equal learning rates, a larger network learns
-            faster, as the sums from which its output is computed have more terms that change.
+            Whether to reduce the paper's learning rates for larger networks. With n times the
+            nodes of the paper's network, all learning rates except that of the output's
+            threshold are divided by n. With n times the inputs, only the learning rate of the
+            weights of the inputs is divided by n. With equal learning rates, a larger network
+            learns faster, as the sums from which its output is computed have more terms that
+            change.
         direction
             Sign of the plant's gain that each network assumes: -1 (right) or 1 (wrong).
         """

@@ -22,7 +22,7 @@ from benchmarks.loop.scenarios import (
 from mptc_gym.evaluation import SEED
 
 _SCENARIOS_HELP = (
-    f"The cases to run (default: all). The cases of the paper are {', '.join(SCENARIOS)}. With "
+    f"The cases to run (default: all). The cases are {', '.join(SCENARIOS)}. With "
     f"--presets, the cases are {', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set, "
     f"the cases are {', '.join(setpoint.name for setpoint in SETPOINTS)}."
 )
@@ -42,7 +42,7 @@ class Options:
     scenarios: Annotated[Names | None, Parameter(help=_SCENARIOS_HELP)] = None
     plant: PlantOptions = field(default_factory=PlantOptions)
     presets: bool = False
-    """Run the presets of the environment instead of the cases of the paper."""
+    """Run a case for each preset of the environment instead of the default cases."""
     runs: Runs = 100
     """The number of runs of each controller in each case."""
     seed: Seed = SEED

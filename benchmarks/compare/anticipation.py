@@ -25,10 +25,12 @@ from benchmarks.loop.scenarios import Scenario
 Array = NDArray[np.float64]
 
 # A controller anticipates if the temperature makes at least the share `LEAST_MOVEMENT` of a
-# set-point change before the temperature can respond to the change.
+# set-point change before the temperature can respond to the change, and if the 95 % confidence
+# interval of this share lies above 0.
 LEAST_MOVEMENT = 0.05
-# Number of different unforeseeable set points. As the least possible error for a set point
-# takes long to compute, a tenth of the runs has the same set point.
+# Largest number of different unforeseeable set points. As the least possible error for a set
+# point takes long to compute, the runs are divided into this many groups, and all runs of a
+# group have the same set point.
 TIMETABLES = 10
 TIMETABLE_SEED = 0  # seed of the first unforeseeable set point, not of an episode
 
@@ -84,8 +86,9 @@ def anticipation(
     """Return how much a controller anticipates the changes of a square wave.
 
     A controller that acts before the changes runs again with set points whose changes nobody
-    can foresee. The result is None if the controller does not act before the changes, or the
-    set point of the scenario is not a square wave.
+    can foresee. The result is None if the controller does not act before the changes, if its
+    error is not smaller than with an output of 0 degC, or if the set point of the scenario is
+    not a square wave.
 
     `members` has a record of the controller for each trained network, and `trajectories` has
     the signals of each member in the scenario. Each member has `runs` runs. If all runs are
@@ -118,13 +121,13 @@ def movement_before_changes(
     """Return how far the output moves to a new set point before it can respond to the change.
 
     The result is a share of the set-point change, a mean over all changes and all runs. The
-    result is None if the set point changes too often for measuring the movement.
+    result is None if the set point never changes, or too often for measuring the movement.
 
     In a plant with a delay of d samples, a flow first affects the output d + 1 samples later.
-    Hence the output in the first d + 1 samples after a set-point change, where d is the delay,
-    does not depend on the flows at or after the change. The movement is the mean output in the
-    d + 1 samples after the change, minus the mean output in a window of d + 1 samples before
-    the change, where d is the delay of the plant. The window lies between a quarter and three
+    Hence the output in the d + 1 samples from a set-point change on does not depend on the
+    flows at or after the change. The movement is the mean output in these d + 1 samples, minus
+    the mean output in a window of d + 1 samples before the change. If the delay of the plant is
+    drawn from a range, d is the smallest delay. The window lies between a quarter and three
     quarters of the time for which the old set point is constant. Of all such windows, the
     movement uses the window in which the mean output is nearest to the new set point. A
     controller whose output oscillates around the old set point, or has not reached the old set

@@ -53,7 +53,7 @@ class Result:
     responses : pandas.DataFrame
         Table of temperature and flow with a row for each sample, from `responses_over_time`.
     policies : sequence of mapping
-        Provenance of each trained network of the controller.
+        Provenance of each member of which a provenance is known, such as a trained network.
     seconds : float
         Processor time of the runs, s.
     anticipation : Anticipation, optional
@@ -161,7 +161,7 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     Raises
     ------
     ValueError
-        If no controller can have a smaller error in `scenario` than an idle valve.
+        If the error of an idle valve in `scenario` is not above the least possible error.
     """
     arguments = {
         "samples": scenario.samples,
@@ -170,8 +170,9 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
         **scenario.arguments,
     }
     least = least_possible(**arguments)
-    # The method `score` is called only because it raises a ValueError if an idle valve is as
-    # good as any controller. The scores themselves are computed in `estimate`.
+    # The method `score` is called only because it raises a ValueError if the error of an idle
+    # valve is not above the least possible error. `estimate` computes the scores of
+    # controllers.
     least.score(0.0)
     # The kind "preview" is for controllers that know all future set points.
     preview = least_possible(kind="preview", **arguments)
@@ -212,7 +213,7 @@ def estimate(
           controller anticipates, the scores are from runs with unforeseeable set points;
         - `mark`: "‡" if the controller anticipates, and otherwise "";
         - `difference`: the mean over the runs of the controller's error minus the error of the
-          reference controller in the same run, degC, an `Estimate`;
+          reference controller in the same run (the mean over its members), degC, an `Estimate`;
         - `improvement`: the share of the runs in which the controller's error is smaller than
           the error of the reference controller, an `Estimate`. A run in which both controllers
           have equal errors counts as half a run.
@@ -265,10 +266,10 @@ def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
 def misfits_of(
     controllers: Mapping[str, ControllerSpec], plants: Sequence[Parameters]
 ) -> dict[str, str]:
-    """Return why a controller was made for another plant than one of `plants`, by its name.
+    """Return a sentence for each controller that does not fit all of `plants`, by its name.
 
-    Controllers that fit all plants are left out. If a controller does not fit several plants,
-    the sentence gives the reason for the first of these plants.
+    The sentence says for which other plant the controller was made. If a controller does not
+    fit several plants, the sentence gives the reason for the first of these plants.
     """
     misfits: dict[str, str] = {}
     for name, controller in controllers.items():

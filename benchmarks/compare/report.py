@@ -457,7 +457,8 @@ def robustness_texts(controller: ControllerSpec, scenario: Scenario) -> tuple[st
 
     The first text is Ms, the maximum sensitivity of the loop with the nominal plant of the
     scenario, and the second text is the range of the delays, in samples, with which the loop is
-    stable. If the controller is not linear, both texts are empty.
+    stable. If the loop is unstable, the texts are "unstable" and "none". If the controller is
+    not linear, both texts are empty.
     """
     if not controller.linear:
         return "", ""

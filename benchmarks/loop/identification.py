@@ -5,8 +5,8 @@ Box-Jenkins model) describes the temperature as the sum of three parts:
 
 - the flow response: the output of a dead zone, a delay, one or two lags and a gain in series,
   whose input is the flow;
-- the background: a constant, the decay of the plant's state at the first row, the responses to
-  measured disturbances, and the responses to steps of unmeasured loads;
+- the background: a constant, the decay of the plant's state at the first fitted row, the
+  responses to measured disturbances, and the responses to steps of unmeasured loads;
 - coloured noise C(z^-1) / D(z^-1) xi, with two polynomials C and D and the white noise xi.
 
 The fit minimises the sum of the squared prediction errors, which are estimates of the white
@@ -49,7 +49,8 @@ SMALLEST_COMBINATION = 1e-8
 MOST_BLOCKS = 2000  # largest number of blocks of rows in a fit; more blocks only take longer
 # Number and weight of the first blocks. The filter that whitens the noise has not settled in
 # the first blocks, so the prediction errors are as large as the noise, and get a small
-# weight. With the weight 0, the fit would not determine the plant's state at the first row.
+# weight. With the weight 0, the fit would not determine the plant's state at the first fitted
+# row.
 SETTLING_BLOCKS = 10
 SETTLING_WEIGHT = 0.1
 TINY = 1e-30  # prevents divisions by zero
@@ -143,7 +144,7 @@ class Unknowns(NamedTuple):
 
     @property
     def slow(self) -> float:
-        """The larger time constant of the two lags, samples."""
+        """The time constant of a single lag, or the larger one of two lags, samples."""
         return float(np.exp(self.log_slow))
 
     @property
@@ -208,7 +209,10 @@ class Fit:
 
     @cached_property
     def flow_response(self) -> Array:
-        """The change of the temperature that the flow causes, degC, shape (rows,)."""
+        """The temperature change caused by all changes of the flow since the first row, degC.
+
+        The returned array has the shape (rows,).
+        """
         return self.unknowns.gain * self.unknowns.respond(self.zone.passed(self.log.flow))
 
     @cached_property
@@ -271,8 +275,8 @@ class Fit:
     def improvement(self, squares: Array | float) -> Array:
         """Return twice the log-likelihood ratio of other fits to this fit: above 0 if better.
 
-        `squares` has the sums of squared prediction errors of the
-        other fits, degC^2, and the result has the shape of `squares`.
+        `squares` has the sums of squared prediction errors of the other fits, degC^2, and the
+        result has the shape of `squares`.
         """
         return np.asarray(len(self.errors) * np.log(self.squares / (squares + TINY)))
 
@@ -301,9 +305,9 @@ class Fit:
     def refined(self, evaluations: int = 25) -> "Fit":
         """Return this fit with its parameters `unknowns` improved by nonlinear least squares.
 
-        The search starts from the values in `unknowns`, and finds a local minimum of the sum of
-        squared prediction errors. The returned fit has `standard_errors`. `evaluations` is the
-        largest number of steps of the search.
+        The search starts from the values in `unknowns`, and descends towards a local minimum of
+        the sum of squared prediction errors. The returned fit has `standard_errors`.
+        `evaluations` is the largest number of steps of the search.
         """
         longest_delay = len(self.log.flow) / 6.0
         highest = HIGHEST._replace(delay=longest_delay, log_slow=np.log(2.0 * longest_delay))
@@ -342,8 +346,11 @@ def possible_zones(
 
     `flow` is the flow of the log, t/h, shape (rows,). `operating_flow` is the centre of all
     dead zones, t/h; if `operating_flow` is None, the centres lie in the whole range of the
-    flow. If `applied` is true, the flow was measured behind the valve, and all returned dead
-    zones have the half width 0.
+    flow. If `applied` is true, the flow was measured behind the valve, and the only returned
+    dead zone has the half width 0. If `flow` has only two different values, there are two dead
+    zones: one with the half width 0, and one that contains all flows. In both of these cases,
+    the centre is `operating_flow` or, if `operating_flow` is None, the middle of the range of
+    the flow.
     """
     centres = np.linspace(flow.min(), flow.max(), GRID_POINTS)
     if operating_flow is not None:
@@ -385,7 +392,8 @@ def first_fit(log: Log, zones: list[DeadZone], end_row: int | None) -> Fit:
         fits.append(replace(fit, unknowns=start).refined(12))
     fit = min(fits, key=lambda fit: fit.squares)
     # Temperatures during the delay depend on flows from before the log. The first fitted row is
-    # later than the delay by a margin, because the delay of the first fit is not exact.
+    # later than the delay by a margin, because the delay of the first fit is not exact. But at
+    # most a sixth of the rows is left out.
     first_row = int(1.3 * fit.unknowns.delay + fit.unknowns.slow / 4.0) + 3
     return replace(fit, first_row=min(first_row, rows // 6))
 
@@ -407,9 +415,9 @@ def try_zones(fit: Fit) -> pd.DataFrame:
 def with_zone(fit: Fit) -> Fit:
     """Return `fit` with a new dead zone: the mean of the likeliest dead zones in `fit.zones`.
 
-    If no dead zone improves a fit without a dead zone by `IMPROVEMENT_BY_DEAD_ZONE`, the half
-    width of the new dead zone is 0. The gain, the delay, the time constants and the noise model
-    of `fit` are not changed.
+    If no dead zone improves a fit without a dead zone by `IMPROVEMENT_BY_DEAD_ZONE`, the new
+    dead zone has the half width 0 and the mean of all centres in `fit.zones`. The gain, the
+    delay, the time constants and the noise model of `fit` are not changed.
     """
     table = try_zones(fit)
     most = table.improvement.max()
@@ -428,7 +436,7 @@ def with_lags(fit: Fit) -> Fit:
     `IMPROVEMENT_BY_SECOND_LAG`.
     """
     single = replace(fit, unknowns=fit.unknowns._replace(ratio=0.0)).refined()
-    # In a model with two lags, the second lag replaces a part of the delay of one lag.
+    # The second lag replaces a part of the delay of the model with one lag.
     start = single.unknowns._replace(delay=0.7 * single.unknowns.delay, ratio=0.4)
     double = replace(single, unknowns=start).refined()
     return double if single.improvement(double.squares) > IMPROVEMENT_BY_SECOND_LAG else single
@@ -438,7 +446,8 @@ def with_load_steps(fit: Fit) -> Fit:
     """Return `fit` with new steps of unmeasured loads, which replace the load steps of `fit`.
 
     Up to `MOST_LOAD_STEPS` load steps are added one by one, always the step that improves the
-    fit most. A load step is added only if it improves the fit by `IMPROVEMENT_BY_LOAD_STEP`.
+    fit most, among steps in evenly spaced rows. A load step is added only if it improves the
+    fit by `IMPROVEMENT_BY_LOAD_STEP`.
     """
     fit = replace(fit, load_steps=())
     slow = fit.unknowns.slow
@@ -508,8 +517,9 @@ def explained_share(fit: Fit) -> float:
 
     A model that is fitted to the first two thirds of the log simulates the temperature in the
     last third from the flow and the measured disturbances. The result is the share of the
-    variance of the temperature in the last third that the simulation explains: 1 for a perfect
-    simulation, and below 0 for a simulation that is worse than a constant.
+    variance of the temperature in the last third that the simulation explains: 1 if the
+    simulation differs from the temperature by a constant or not at all, and below 0 for a
+    simulation that is worse than a constant.
     """
     end_row = 2 * len(fit.log.flow) // 3
     earlier = identify(fit.log, fit.zones, end_row)

@@ -107,7 +107,7 @@ SCENARIOS = {
         {**_CONSTANT, "disturbance_amplitude": 1.5, "disturbance_interval": 200.0},
     ),
 }
-"""The cases of the paper, and steps of the load, by name."""
+"""The cases of the paper, and a case with steps of the load, by name."""
 PRESET_SCENARIOS = {
     name: Scenario(name, f"preset {name}", 1200, dict(arguments))
     for name, arguments in PRESETS.items()
@@ -149,8 +149,8 @@ class PlantOptions:
         """Return the cases of the chosen plant by name, or `default` if no plant is chosen.
 
         The cases of a chosen plant are "square" and "constant", with the set points in
-        `SETPOINTS`. If the user's arguments of the plant define a set point, the only case is
-        "run", with the user's set point.
+        `SETPOINTS`. If the arguments of the chosen plant define a set point, the only case is
+        "run", with this set point.
         """
         arguments = self.arguments()
         if not self.name:
@@ -212,7 +212,7 @@ def _read_plant(file: Path) -> Arguments:
 
 
 # Ranges of the arguments of the plants that `random_design` returns, by name. With a gain
-# factor below 0.74, the largest flow could not hold the temperature at 5 degC.
+# factor below about 0.733, the largest flow could not hold the temperature at 5 degC.
 SPANS = {
     "delay": (6, 36),
     "dead_zone": (0.0, 8.0),
@@ -258,6 +258,7 @@ def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Ar
     twice the delay of the other plant. Dead zones, gain factors and time constant factors are
     scaled in proportion to the values of the two plants. Noise variances are scaled in
     proportion to the square of the temperature change that half the range of the flow causes.
+    Drifts are not scaled.
 
     `nominal_plant` has the environment's arguments for the other plant. A variation is a dict
     of the arguments of the environment that differ from a nominal plant.

@@ -108,7 +108,7 @@ def draw_sorted(plants: pd.DataFrame, path: Path) -> None:
             axes.plot(shares, excess(ratios), label=label(agent), linewidth=1.3, **look)
         if styles:
             scale_by_ratio(axes, plants["ratio"])
-            # The controller with the largest errors is the uppermost line.
+            # The legend has the order of the curves: the worst controller is uppermost.
             figure.legend(loc="outside right center", reverse=True)
         axes.set_xlim(0.0, 100.0)
         axes.set_xlabel("share of the plants (%), sorted by the error ratio of each controller")
@@ -220,7 +220,9 @@ def _draw_controller(axes: Axes, plants: pd.DataFrame, classes: BoundaryNorm) ->
 def _legend_of_map(plants: pd.DataFrame) -> dict[str, Artist]:
     """Return the legend of the maps: matplotlib's lines and patches, by their texts.
 
-    The legend has only marks that occur in the maps.
+    The legend always has the mark of the nominal plant. The legend has an entry for
+    oscillation, for control that is no better than an idle valve, and for an unknown least
+    possible error only if this occurs on a plant.
     """
     entries: dict[str, Artist] = {"the nominal plant": Line2D([], [], **NOMINAL_MARK)}
     if (plants["oscillates"] >= MARKED_SHARE).any():
