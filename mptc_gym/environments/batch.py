@@ -237,7 +237,8 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             self._ended = still_ended if still_ended.any() else None
         flags = self._as_array(mask)
         first_infos = self._begin(mask)
-        for name in {*self._info_names, *first_infos}:
+        # A dict and not a set, whose order would differ from process to process.
+        for name in dict.fromkeys([*self._info_names, *first_infos]):
             values = first_infos.get(name, self._zeros)
             infos[name] = self._where(flags, values, infos.get(name, 0))
             infos.setdefault(f"_{name}", flags)
