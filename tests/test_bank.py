@@ -336,3 +336,20 @@ def test_a_controller_with_a_single_model_accepts_a_long_delay():
 def test_an_invalid_range_of_times_is_refused_when_a_controller_is_made(name, limits):
     with pytest.raises(ValueError, match=f"{name} must be two finite numbers of at least 0"):
         SelfTuningController(**KNOWN, **{name: limits})
+
+
+def test_a_set_point_that_may_soon_change_is_hedged():
+    plant = {"gain": -0.7, "time_constant": 160.0, "delay": 152.0}
+    flows_of_controllers = []
+    for holds in (None, (800.0, 2400.0)):  # s; 100 to 300 samples
+        controller = SelfTuningController(
+            **plant, dead_zone=0.0, setpoint_holds=holds, setpoint_amplitude=5.0
+        )
+        observation = np.array([4.0, 4.0, 4.0, 0.0, 0.0, 0.0])  # settled at the set point
+        flows = [controller.act(observation)[0] for _ in range(290)]
+        flows_of_controllers.append(np.array(flows))
+    without, hedged = flows_of_controllers
+    # The shortest hold time is 100 samples, and a flow affects the output after 20 samples.
+    assert np.abs(hedged - without)[:60].max() < 1e-6
+    # More flow lowers the temperature, towards the mean of the next set point.
+    assert (hedged - without)[240:].min() > 0.1
