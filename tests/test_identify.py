@@ -96,6 +96,14 @@ class TestFit:
         assert intervals.value["delay"] == pytest.approx(18.0, abs=1.5)
         assert intervals.high["dead_zone"] > 7.0  # Three flows do not show it.
 
+    def test_decay_from_a_start_far_from_rest_is_part_of_the_model(self):
+        log = recorded(dead_zone=0.0)
+        decay = 20.0 * np.exp(-np.arange(1200) / 20.1)  # with the plant's own time constant
+        fit = identify(replace(log, temperature=log.temperature + decay), 0.0)
+        early = slice(fit.first_row, fit.first_row + 5)
+        assert fit.simulated[early] == pytest.approx(fit.log.temperature[early], abs=1.5)
+        assert not fit.load_steps
+
     def test_step_of_a_load_is_found(self):
         log = recorded(dead_zone=0.0)
         load = 6.0 * (1.0 - np.exp(-np.maximum(np.arange(1200) - 650, 0) / 20.0))
@@ -184,6 +192,7 @@ class TestLog:
 
     def test_thousands_beside_a_stopped_pump_are_refused(self, tmp_path):
         rows = [f"{8 * k};{('0', '850', '1.100')[k % 3]};{k % 7}.25" for k in range(120)]
+        rows[9] = "72;;2.25"
         with pytest.raises(UsageError, match=r"line 4: flow .* got '1.100'"):
             read("\n".join(["time;flow;temperature", *rows]), tmp_path)
 
