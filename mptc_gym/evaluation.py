@@ -253,12 +253,14 @@ def _name_with_changes(name: str, case: Parameters) -> str:
 
     `name` is an id, or the name of a class; `case` has the arguments of the environment.
     """
-    presets = {id_of_preset: preset for preset, id_of_preset in IDS.items()}
-    if name not in presets:
+    preset_of_id = {id_of_preset: preset for preset, id_of_preset in IDS.items()}
+    if name not in preset_of_id:
         return name
-    own = case_of(Parameters(**PRESETS[presets[name]]))
-    changed = [key for key, value in asdict(case).items() if value != getattr(own, key)]
-    return f"{name} with another {', '.join(changed)}" if changed else name
+    arguments_of_id = asdict(case_of(Parameters(**PRESETS[preset_of_id[name]])))
+    changed = [key for key, value in asdict(case).items() if value != arguments_of_id[key]]
+    if not changed:
+        return name
+    return f"{name} with another {', '.join(changed)}"
 
 
 def _run(

@@ -127,8 +127,8 @@ def _act_on_tensors(call: Callable[[Any], Any], module: Any) -> Act:
     weights of a floating-point type, the tensors are of float32 on the CPU.
     """
     torch: Any = sys.modules["torch"]  # not imported, as this package does not depend on it
-    all_weights = (tensor for tensor in module.parameters() if tensor.is_floating_point())
-    weights = next(all_weights, torch.empty(0))
+    float_weights = (tensor for tensor in module.parameters() if tensor.is_floating_point())
+    weights = next(float_weights, torch.empty(0))
 
     def to_tensors(observations: Any) -> Any:
         """Return an array, or the arrays in a dict or a tuple, as tensors."""
