@@ -346,6 +346,7 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
         sentences.append(
             "The interval of the gain contains 0: the sign of the gain is unknown."
         )
+    # The limits of sound logs differ by a factor of less than two.
     if intervals.high["time_constant"] > 4.0 * intervals.low["time_constant"]:
         sentences.append(
             "The interval of the time constant is wide: the plant may have more lags than the "
@@ -357,6 +358,7 @@ def doubts(fit: Fit, intervals: pd.DataFrame, explained: float) -> list[str]:
             "the flow of the row before: the delay and its interval are not reliable if the "
             "flow changes in most rows."
         )
+    # Temperatures of boilers and heat exchangers are not recorded ten times a second.
     if log.sampling_interval < 0.1:
         sentences.append(
             f"The sampling interval is {log.sampling_interval:g} s: the times are perhaps in "
@@ -402,6 +404,7 @@ def doubts_about_sensor(temperature: NDArray[np.float64]) -> list[str]:
         sentences.append(
             f"The temperature is frozen: {longest} rows in succession have the same value."
         )
+    # Single wrong readings, such as 0 or -9999, lie outside the range of 98 % of all readings.
     low, high = np.quantile(temperature, [0.01, 0.99])
     is_outlier = np.abs(temperature - (low + high) / 2.0) > 3.0 * (high - low)
     if 0 < np.sum(is_outlier) < len(temperature) / 100.0:
