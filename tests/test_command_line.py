@@ -52,7 +52,6 @@ def test_help_imports_nothing_heavy():
     assert {"nn-frozen", "square-dead-zone-7"} <= {*re.split(r"[\s,]+", done.stdout)}
 
 
-LOG = ROOT / "benchmarks/logs/example.csv"
 REFUSED = {
     "claims": [(["everything"], "no 'everything'")],
     "compare": [
@@ -79,11 +78,6 @@ REFUSED = {
         (["--out", "/proc/here"], "cannot be written to: "),
     ],
     "datasets": [(["middlepoint/paper/ppo-v0"], 'Choose from: "middle')],
-    "identify": [
-        (["none.csv"], "none.csv cannot be read: No such file"),
-        ([LOG, "--u-min", "nan"], 'value "nan" for --u-min. Must be < inf'),
-        ([LOG, "--operating-flow", "1e9"], "--operating-flow must be near the flows"),
-    ],
     "speed": [
         (["--device", "toaster"], "--device: device must be a device that PyTorch can use"),
     ],

@@ -8,7 +8,6 @@ pandas are imported inside the function `work`, so that `--help` is quick.
 
 import errno
 import inspect
-import math
 import os
 import shlex
 import signal
@@ -61,7 +60,6 @@ def _integers(least: int, most: int) -> Parameter:
 Count = Annotated[int, _integers(1, 1_000_000_000)]
 Runs = Annotated[int, _integers(1, 100_000)]
 Seed = Annotated[int, _integers(0, 2**63)]
-Finite = Annotated[float, Parameter(validator=Number(gt=-math.inf, lt=math.inf))]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
 Folder = Annotated[Path, Parameter(help="The folder to write to.")]
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = "#0072B2", "#D55E00"  # colours of lines that do not belong to a controller
 WIDTH = 7.5  # width of a picture, inches: 975 pixels at 130 dots per inch
 TITLE_CHARACTERS = 90  # number of characters that fit in a line of a title
 PALETTE_SIZE = 128  # number of colours in a PNG file; fewer colours make the file smaller

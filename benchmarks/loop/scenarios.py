@@ -120,8 +120,7 @@ class PlantOptions:
     """Options that choose the plant by a file, by a preset or by single arguments."""
 
     plant: Path | None = None
-    """JSON file with arguments of the environment, such as the plant.json that
-    benchmarks.identify writes."""
+    """JSON file with arguments of the environment."""
     preset: Annotated[str | None, Parameter(choices=PRESETS)] = None
     """Name of a plant that the environment defines, such as hard."""
     set: tuple[str, ...] = ()
