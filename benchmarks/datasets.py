@@ -16,7 +16,7 @@ from benchmarks.lib.errors import UnfinishedError
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.lib.storage import out_folder
 from mptc_gym import PRESETS, evaluate
-from mptc_gym.scoring.rollout import rollout
+from mptc_gym.rollout import rollout
 
 SAMPLES = 1200  # number of samples in an episode
 EPISODES = 100  # default number of episodes in a data set

@@ -18,10 +18,10 @@ from mptc_gym.plant.checks import MOST_PLANTS, count
 from mptc_gym.plant.dynamics import action_from_command
 from mptc_gym.plant.parameters import ARGUMENTS, Parameters
 from mptc_gym.presets import IDS, PRESETS
+from mptc_gym.rollout import Sample, replayed, rollout
 from mptc_gym.scoring.fit import check_fit
 from mptc_gym.scoring.opening import Plants, opened
 from mptc_gym.scoring.policies import start
-from mptc_gym.scoring.rollout import Sample, replayed, rollout
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
 Values = NDArray[np.float64]  # one number for each episode, shape (episodes,)

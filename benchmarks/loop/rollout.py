@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.plant.dynamics import action_from_command, least_effective_command
 from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
-from mptc_gym.scoring.rollout import rollout as run_batch
+from mptc_gym.rollout import rollout as run_batch
 
 Array = NDArray[np.float64]
 

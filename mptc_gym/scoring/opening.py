@@ -25,9 +25,9 @@ from mptc_gym.environments.layers import (
 )
 from mptc_gym.environments.making import Env, make_batch, make_one
 from mptc_gym.plant.checks import reject
+from mptc_gym.rollout import infos_in_arrays
 from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.policies import form_of
-from mptc_gym.scoring.rollout import infos_in_arrays
 
 # Base class of the attribute `policy` of a Stable-Baselines3 model.
 _POLICY_NETWORK: Final = "stable_baselines3.common.policies.BaseModel"
