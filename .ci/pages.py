@@ -18,7 +18,7 @@ from mptc_gym.plant.parameters import argument_table
 ROOT = Path(__file__).parent.parent
 CONTRIBUTING = ".github/CONTRIBUTING.md"
 # Suffixes of the files that the site shows or offers as they are.
-SHOWN = {".csv", ".gif", ".ipynb", ".json", ".md", ".png", ".txt", ".yml"}
+SHOWN = {".csv", ".ipynb", ".json", ".md", ".png", ".txt", ".yml"}
 ARGUMENTS = markdown.markdown(argument_table(), extensions=["tables"])  # a table in HTML
 # Names of constants of `mptc_gym.evaluation` in a signature, in HTML.
 CONSTANT = re.compile(r'<span class="n">(SEED|EPISODES)</span>')

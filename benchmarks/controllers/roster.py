@@ -1,7 +1,7 @@
 """List the controllers that the commands can run, as records of the class `ControllerSpec`.
 
-The commands `compare`, `sweep` and `watch` can run each controller of the roster. The command
-`tune` can search the gains of each controller whose record has `spans`. The option
+The commands `compare` and `sweep` can run each controller of the roster. The command `tune`
+can search the gains of each controller whose record has `spans`. The option
 `--agent NAME=MODULE:FACTORY` of a command makes a record for a user's own controller.
 """
 

@@ -5,7 +5,6 @@ from typing import NoReturn
 
 # The extra of this project, as in `pip install -e ".[EXTRA]"`, that installs each package.
 EXTRAS = {
-    "PIL": "bench",
     "cyclopts": "compare",
     "filelock": "compare",
     "h5py": "data",
@@ -14,7 +13,6 @@ EXTRAS = {
     "minari": "data",
     "optuna": "bench",
     "pandas": "compare",
-    "pygame": "bench",
     "ray": "ray",
     "rich": "compare",
     "scipy": "compare",

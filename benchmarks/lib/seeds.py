@@ -25,7 +25,7 @@ class Block:
 
 
 SEEDS = {
-    "studies": Block(0, 10_000, "runs of sweeps, claims and films, which are only measured"),
+    "studies": Block(0, 10_000, "runs of sweeps, claims and former films, only measured"),
     "networks": Block(10_000, 1_000, "initial weights of networks, and their training"),
     "sampler": Block(1_000_000, 100_000, "gains that a search tries"),
     "preparation": Block(

@@ -1,7 +1,6 @@
 """Write text, JSON and CSV files with the same bytes on all operating systems."""
 
 import json
-import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -49,11 +48,3 @@ def out_folder(folder: Path, option: str = "--out") -> Path:
         reason = error.strerror
         raise UsageError(f"{option}: {folder} cannot be written to: {reason}") from error
     return folder
-
-
-def file_name(text: str) -> str:
-    """Return `text` as a safe part of a file name, with at most 100 characters.
-
-    Each character of `text` that is not a letter, a digit, `-` or `_` becomes `_`.
-    """
-    return re.sub(r"[^\w-]", "_", text)[:100]
