@@ -15,7 +15,8 @@ from mptc_gym.plant.signals import SetPointLevels
 
 LEARNING = 1200  # samples of the square wave in which a controller learns before it is measured
 COMMISSIONING_SEED = SEEDS["preparation"].first  # of the episodes in which a controller learns
-# Maximum sensitivity Ms of the control loop, from which a controller's time constant is chosen.
+# Maximum sensitivity Ms of the control loop, from which a controller's time constant is chosen:
+# the largest magnitude of the loop's sensitivity function, which is low for a robust loop.
 # The time constant of the tuning rule SIMC leads to an Ms of 1.56.
 ROBUSTNESS = 1.6
 
@@ -117,10 +118,8 @@ class ControllerSpec:
         many trials and samples.
     tuned_by : str
         Name of the argument of `build`, a time constant in s, that is chosen so that the
-        maximum sensitivity of the control loop is `sensitivity`; "" if no argument is chosen.
-    sensitivity : float
-        Maximum sensitivity Ms of the control loop with the nominal plant: the largest magnitude
-        of the loop's sensitivity function.
+        maximum sensitivity of the control loop with the nominal plant is `ROBUSTNESS`; "" if no
+        argument is chosen.
     linear : bool
         Whether the controller is linear for commands outside the dead zone and within the
         limits. A linear controller has a method `transfer`, which returns the transfer function
@@ -168,7 +167,6 @@ class ControllerSpec:
     knows: str = ""
     searched: str = ""
     tuned_by: str = ""
-    sensitivity: float = ROBUSTNESS
     linear: bool = False
     assumes: Sequence[str] = ()
     made_for: Mapping[str, Any] = field(default_factory=dict)
@@ -243,8 +241,8 @@ class ControllerSpec:
 
         The time constant is the argument of `build` that `tuned_by` names. The control loop
         with the nominal plant is robust enough if its maximum sensitivity Ms is at most
-        `sensitivity`. The time constant is rounded to four digits, so that all machines return
-        the same number. The rounding can raise Ms slightly above `sensitivity`.
+        `ROBUSTNESS`. The time constant is rounded to four digits, so that all machines return
+        the same number. The rounding can raise Ms slightly above `ROBUSTNESS`.
         """
         parameters = Parameters(**plant)
         arguments = knowledge(self.prior_knowledge, parameters, 1, 0)
@@ -256,7 +254,7 @@ class ControllerSpec:
         slowest = 30.0 * (arguments["time_constant"] + arguments["delay"])
         fastest = 0.1 * arguments["sampling_interval"]
         model = nominal(parameters)
-        exact = time_constant_for(self.sensitivity, build, model, slowest, fastest)
+        exact = time_constant_for(ROBUSTNESS, build, model, slowest, fastest)
         return float(f"{exact:.4g}")
 
     def loop(self, plant: Mapping[str, Any]) -> LinearLoop:
