@@ -9,7 +9,6 @@ import pytest
 from scipy import linalg, optimize, signal
 
 from agents.hedge import RandomSetpoint
-from benchmarks import sweep
 from benchmarks.bounds import __main__ as command
 from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
@@ -270,8 +269,6 @@ class TestLeastPossible:
             least_possible(samples=1201, **case)
         with pytest.raises(np.linalg.LinAlgError):
             command.row(Scenario("a", "b", 1201, case), command.Options(episodes=1, seed=0))
-        with pytest.raises(np.linalg.LinAlgError):
-            sweep.run_idle_valve({**case, "delay": 17}, 1)
 
     def test_score(self):
         least = least_possible(samples=600, setpoint=5.0)

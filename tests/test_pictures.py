@@ -10,11 +10,9 @@ from matplotlib.figure import Figure
 
 from benchmarks.compare import plots
 from benchmarks.controllers.roster import looks
-from benchmarks.lib.pictures import STYLE, scale_by_ratio
+from benchmarks.lib.pictures import STYLE
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
-from benchmarks.plots import sweep
-from mptc_gym import Parameters
 
 
 def ticks(axis):
@@ -35,32 +33,6 @@ class TestFindings:
         errors = pd.Series({"mpc": 0.5, "nn": 1.0, "pi": 1.27})
         finding = plots.responses_finding(errors)
         assert finding == "PI (1992) has 2.5 times the mean error of MPC"
-
-    def test_of_plants(self):
-        ratios = {"pi": [1.0, 2.0, 3.0, np.nan], "smith": [1.01, 1.04, 1.2, 1.05]}
-        rows = [(agent, ratio) for agent, of in ratios.items() for ratio in of]
-        plants = pd.DataFrame(rows, columns=["agent", "ratio"])
-        assert sweep.map_finding(plants) == (
-            "Smith is within 5 % of the least possible error on 75 % of the plants, "
-            "PI (1992) on 33 %"
-        )
-        third = pd.DataFrame({"agent": "nn", "ratio": [1.0, 2.0, 2.0, 2.0]})
-        assert sweep.map_finding(pd.concat([plants, third])).endswith(
-            "PI (1992) on 33 %, and every other controller on at most 25 %"
-        )
-        assert sweep.sorted_finding(plants) == (
-            "On nine plants out of ten, the error ratio is at most 1.16 for Smith and 2.80 for "
-            "PI (1992)"
-        )
-
-
-def test_a_ratio_below_the_axis_is_said_at_its_tick():
-    for ratios, lowest in (([1.5, 1.002], "1.001"), ([1.5, 0.98], "≤ 1.001")):
-        axes = Figure().subplots()
-        scale_by_ratio(axes, ratios)
-        assert ticks(axes.yaxis)[:3] == [lowest, "1.003", "1.01"]
-        low, high = axes.get_ylim()
-        assert 0.0 < low < 0.002 < 0.5 < high
 
 
 @pytest.fixture
@@ -148,28 +120,3 @@ class TestResponses:
         plots.plot_responses(rows, pd.Series({"pi": 1.0}), case, tmp_path / "case.png")
         (legend,) = figures[0].legends
         assert [text.get_text() for text in legend.get_texts()] == texts
-
-
-def runs_on_plants(**columns):
-    rows = [
-        {"agent": agent, "plant": i, "delay": 10 + i // 2, "gain_factor": 0.9 + 0.1 * (i % 2)}
-        for agent in ("pi", "smith")
-        for i in range(4)
-    ]
-    runs = pd.DataFrame(rows)
-    runs["ratio"] = np.where(runs["agent"] == "pi", 2.0, 1.1)
-    return runs.assign(**{"oscillates": False, "useless": False, **columns})
-
-
-def test_controllers_of_a_sweep_are_sorted_by_result():
-    plants = sweep.plant_medians(runs_on_plants())
-    assert list(plants["agent"].unique()) == ["smith", "pi"]
-
-
-@pytest.mark.parametrize("columns", [{}, {"dead_zone": 5.0}, {"ratio": np.nan}])
-def test_any_sweep_can_be_drawn(columns, tmp_path):
-    runs = runs_on_plants(**columns)
-    for shown in (runs, runs[runs["plant"] == 0]):  # a stopped sweep may have one plant
-        path = tmp_path / "map.png"
-        sweep.draw(shown, path, Parameters())
-        assert path.stat().st_size > 1000

@@ -1,8 +1,8 @@
 """List the controllers that the commands can run, as records of the class `ControllerSpec`.
 
-The commands `compare` and `sweep` can run each controller of the roster. The command `tune`
-can search the gains of each controller whose record has `spans`. The option
-`--agent NAME=MODULE:FACTORY` of a command makes a record for a user's own controller.
+The command `compare` can run each controller of the roster. The command `tune` can search the
+gains of each controller whose record has `spans`. The option `--agent NAME=MODULE:FACTORY` of
+`compare` makes a record for a user's own controller.
 """
 
 import itertools
@@ -129,7 +129,6 @@ _SPECS = (
         searched="nothing",
         observation={},
         compared=False,
-        swept=False,
     ),
     ControllerSpec(
         name="nn",
@@ -190,7 +189,6 @@ _SPECS = (
         "trials: 566 M samples, 3 min",
         linear=True,
         assumes=("direction", "scale"),
-        swept=False,
     ),
     ControllerSpec(
         name="smith",
@@ -233,7 +231,6 @@ _SPECS = (
         prior_knowledge=EVERYTHING,
         knows="everything except the future",
         searched="nothing",
-        swept=False,
     ),
     ControllerSpec(
         name="ppo",

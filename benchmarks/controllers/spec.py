@@ -150,8 +150,6 @@ class ControllerSpec:
         smaller magnitude.
     compared : bool
         Whether the command `compare` runs the controller by default.
-    swept : bool
-        Whether the command `sweep` runs the controller by default.
     pictured : bool
         Whether comparisons draw the temperature and the flow of the controller over time.
     provenance : mapping
@@ -177,7 +175,6 @@ class ControllerSpec:
     learns: bool = False
     spans: Callable[[Parameters], plant_scale.Spans] | None = None
     compared: bool = True
-    swept: bool = True
     pictured: bool = False
     provenance: Mapping[str, Any] = field(default_factory=dict)
 

@@ -15,10 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 WIDTH = 7.5  # width of a picture, inches: 975 pixels at 130 dots per inch
@@ -49,21 +47,6 @@ LIMIT: Any = {"color": "0.4", "linestyle": ":", "linewidth": 1.0}
 # The signs for "at most" and "at least" at the ticks of an axis.
 AT_MOST = "\N{LESS-THAN OR EQUAL TO}"
 AT_LEAST = "\N{GREATER-THAN OR EQUAL TO}"
-
-RATIO_LABEL = (
-    "error ratio: mean error / least possible error\n(axis logarithmic in the ratio minus 1)"
-)
-# The smallest error ratio on the axis; smaller error ratios are drawn at `RATIO_FLOOR`. An
-# error ratio of 1 would lie at minus infinity on an axis that is logarithmic in the error ratio
-# minus 1.
-RATIO_FLOOR = 1.001
-# Error ratios with a label on the axis of error ratios, about equally far apart.
-RATIO_TICKS = 1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0, 4.0, 11.0, 31.0
-
-
-def percent(share: float) -> str:
-    """Return a share from 0 to 1 as text in whole percent, such as "5 %" for 0.05."""
-    return f"{100.0 * share:.0f} %"
 
 
 @contextmanager
@@ -98,31 +81,3 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         canvas.draw()  # `Figure.savefig` would draw twice because of the layout.
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     picture.quantize(PALETTE_SIZE, Image.Quantize.FASTOCTREE).save(path)
-
-
-def excess(ratios: ArrayLike) -> NDArray[np.float64]:
-    """Return error ratios minus 1, an array of the shape of `ratios`, for a logarithmic axis.
-
-    Error ratios below `RATIO_FLOOR` are replaced by `RATIO_FLOOR`, so that all results are
-    positive.
-    """
-    return np.maximum(ratios, RATIO_FLOOR) - 1.0
-
-
-def scale_by_ratio(axes: Axes, ratios: ArrayLike) -> None:
-    """Make the y axis of a panel logarithmic in the error ratio minus 1, with ratios as ticks.
-
-    The ends of the axis follow from `ratios`, which are all error ratios in the panel. If an
-    error ratio is below `RATIO_FLOOR`, the label of the lowest tick begins with the sign
-    `AT_MOST`.
-    """
-    from matplotlib.ticker import NullLocator
-
-    heights = excess(ratios)
-    labels = [f"{ratio:g}" for ratio in RATIO_TICKS]
-    if np.min(ratios) < RATIO_FLOOR:
-        labels[0] = f"{AT_MOST} {labels[0]}"
-    axes.set_yscale("log")
-    axes.set_yticks(excess(RATIO_TICKS), labels)
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_ylim(heights.min() / 1.4, heights.max() * 1.4)

@@ -206,7 +206,7 @@ def conditions_of(command: str, options: Any) -> dict[str, Any]:
     Parameters
     ----------
     command
-        Name of the command, such as "sweep".
+        Name of the command, such as "tune".
     options
         Dataclass with the options of the command. In the returned dict, a hash of a file's
         content replaces the file's path, and the options in `WITHOUT_INFLUENCE` are left out.

@@ -3,6 +3,7 @@
 A seed of the environment determines all random numbers of an episode. The ranges of seeds do
 not overlap, so no controller is measured in episodes on which the controller was trained or
 chosen. Random numbers outside of episodes, such as those of a bootstrap, have seeds from 0 on.
+The seeds of commands and networks that are gone stay reserved, as earlier versions used them.
 """
 
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ class Block:
 
 
 SEEDS = {
-    "studies": Block(0, 10_000, "runs of sweeps, claims and former films, only measured"),
+    "studies": Block(0, 10_000, "runs of claims and of commands that are gone"),
     "networks": Block(10_000, 1_000, "initial weights of networks, and their training"),
     "sampler": Block(1_000_000, 100_000, "gains that a search tries"),
     "preparation": Block(

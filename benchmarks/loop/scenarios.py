@@ -1,20 +1,17 @@
-"""Define the cases of comparisons, the options that choose a plant, and random plants.
+"""Define the cases of comparisons, and the options that choose a plant.
 
 A case, or scenario, consists of a plant, a set point and a length of the runs.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
-
 from benchmarks.lib.command import Parameter, options
 from benchmarks.lib.errors import UsageError
-from benchmarks.loop.linear import nominal
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant.parameters import slowest_pole
 
@@ -208,82 +205,3 @@ def _read_plant(file: Path) -> Arguments:
     except (OSError, TypeError, ValueError) as error:
         allowed = 'a JSON file of arguments, such as {"delay": 20}'
         raise UsageError(f"--plant: {file} must be {allowed}: {error}") from error
-
-
-# Ranges of the arguments of the plants that `random_design` returns, by name. With a gain
-# factor below about 0.733, the largest flow could not hold the temperature at 5 degC.
-SPANS = {
-    "delay": (6, 36),
-    "dead_zone": (0.0, 8.0),
-    "noise_variance": (0.0, 1.0),
-    "gain_factor": (0.75, 1.6),
-    "time_constant_factor": (0.5, 2.0),
-}
-# The factors that drift in half of the random plants, and the argument for each factor's drift.
-DRIFTS = {"gain_factor": "gain_drift", "time_constant_factor": "time_constant_drift"}
-
-
-def random_design(count: int, seed: int, samples: int) -> list[Arguments]:
-    """Return the arguments of `count` random plants: a Latin hypercube in the ranges `SPANS`.
-
-    In the second half of the plants, the gain factor and the time constant factor drift over
-    `samples` samples to other values in the ranges `SPANS`. `seed` is the seed of the Latin
-    hypercube.
-    """
-    from scipy.stats.qmc import LatinHypercube  # imported here, as it is slow
-
-    # A plant's row has the values of all arguments, and then the factors at the end of a drift.
-    spans = [*SPANS.values(), *(SPANS[factor] for factor in DRIFTS)]
-    low, high = np.array(spans).T
-    shares = LatinHypercube(len(spans), rng=np.random.default_rng(seed)).random(count)
-    rows = (low + shares * (high - low)).round(4).tolist()
-    plants: list[Arguments] = []
-    for i, row in enumerate(rows):
-        plant = dict(zip(SPANS, row, strict=False))  # without the factors after a drift
-        plant["delay"] = round(plant["delay"])
-        if i >= count // 2:
-            final_factors = row[len(SPANS) :]
-            for factor, final_factor in zip(DRIFTS, final_factors, strict=True):
-                plant[DRIFTS[factor]] = final_factor / plant[factor]
-            plant["drift_samples"] = samples
-        plants.append(plant)
-    return plants
-
-
-def around(nominal_plant: Arguments, variations: Sequence[Arguments]) -> list[Arguments]:
-    """Convert variations of the paper's plant to variations of another plant.
-
-    If a variation has twice the delay of the paper's plant, then the returned variation has
-    twice the delay of the other plant. Dead zones, gain factors and time constant factors are
-    scaled in proportion to the values of the two plants. Noise variances are scaled in
-    proportion to the square of the temperature change that half the range of the flow causes.
-    Drifts are not scaled.
-
-    `nominal_plant` has the environment's arguments for the other plant. A variation is a dict
-    of the arguments of the environment that differ from a nominal plant.
-    """
-    scales = _scales(Parameters(**nominal_plant))
-    paper_scales = _scales(Parameters())
-    scaled_variations: list[Arguments] = []
-    for variation in variations:
-        scaled = dict(variation)
-        for name in SPANS:
-            if name in variation:
-                scaled[name] = scales[name] / paper_scales[name] * variation[name]
-        scaled["delay"] = round(scaled["delay"])
-        scaled_variations.append(scaled)
-    return scaled_variations
-
-
-def _scales(plant: Parameters) -> dict[str, float]:
-    """Return a number for each argument in `SPANS`, with which `around` scales the argument.
-
-    The number is the argument's value for the plant, or the middle of the argument's range. For
-    the noise variance, which may be 0, the number is the square of the temperature change that
-    half the range of the flow causes, degC^2.
-    """
-    model = nominal(plant)
-    flow_change = (model.numbers.u_max - model.numbers.u_min) / 2.0  # t/h
-    temperature_change = float(model.gain) * flow_change  # degC
-    scales = {**vars(model.numbers), "noise_variance": temperature_change**2}
-    return {name: float(scales[name]) for name in SPANS}

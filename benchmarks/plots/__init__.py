@@ -1,1 +1,0 @@
-"""Draw the pictures of sweeps, which compare controllers on many plants."""
