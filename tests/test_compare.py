@@ -112,7 +112,7 @@ def a_comparison(**results):
     return report.Comparison(
         **{
             "controllers": ROSTER, "results": [], "scales": {}, "runs": empty,
-            "estimates": empty, "anticipations": {}, "misfits": {}, "scores": {}, **results,
+            "estimates": empty, "misfits": {}, "scores": {}, **results,
         }
     )  # fmt: skip
 
@@ -122,7 +122,7 @@ class TestEstimates:
         scale = scale_of(SCENARIOS["constant"], 3, SEED)
         limit = scale.least.value
         runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
-        found = estimate(runs.assign(scenario="constant"), {"constant": scale}, {})
+        found = estimate(runs.assign(scenario="constant"), {"constant": scale})
         nn, ppo_ = found.to_dict("records")
         assert (nn["mean"].value, nn["limit"]) == (2.0, limit)
         assert nn["ratio"].value == pytest.approx(2.0 / limit)
@@ -141,7 +141,7 @@ class TestEstimates:
             runs = some_runs(a=[[idle, half]], b=[[least, half]])
             rows.append(runs.assign(scenario=name, total_variation=12.0))
         runs = pd.concat(rows)
-        found = estimate(runs, scales, {})
+        found = estimate(runs, scales)
         scores = ranked(found, {})
         assert scores["b"].value == pytest.approx(0.75)
         best, other = report.score_table(

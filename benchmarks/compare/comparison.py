@@ -16,7 +16,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.bounds.least import LeastPossible, least_possible
-from benchmarks.compare.anticipation import Anticipation, anticipation
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles
@@ -27,10 +26,6 @@ from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES
 
 BOOTSTRAP_SEED = 0  # seed of the resampling for confidence intervals, not of an episode
-
-# The anticipation of each controller that acts before a square wave changes, by the name of the
-# scenario and the name of the controller.
-Anticipations = Mapping[tuple[str, str], Anticipation]
 
 
 @dataclass(frozen=True)
@@ -56,8 +51,6 @@ class Result:
         Provenance of each member of which a provenance is known, such as a trained network.
     seconds : float
         Processor time of the runs, s.
-    anticipation : Anticipation, optional
-        How much the controller anticipates; None if the controller does not anticipate.
     """
 
     scenario: str
@@ -66,7 +59,6 @@ class Result:
     responses: pd.DataFrame
     policies: Sequence[Mapping[str, Any]]
     seconds: float
-    anticipation: Anticipation | None = None
 
 
 def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: int) -> Result:
@@ -103,7 +95,6 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
         responses=responses_over_time(trajectories, scenario, controller.name),
         policies=[dict(member.provenance) for member in members if member.provenance],
         seconds=seconds,
-        anticipation=anticipation(scenario, members, trajectories, runs, seed),
     )
 
 
@@ -179,9 +170,7 @@ def scale_of(scenario: Scenario, runs: int, seed: int) -> Scale:
     return Scale(scenario, least, preview.value)
 
 
-def estimate(
-    runs: pd.DataFrame, scales: Mapping[str, Scale], anticipations: Anticipations
-) -> pd.DataFrame:
+def estimate(runs: pd.DataFrame, scales: Mapping[str, Scale]) -> pd.DataFrame:
     """Estimate the mean errors and the scores of controllers, with 95 % confidence intervals.
 
     Parameters
@@ -194,9 +183,6 @@ def estimate(
     scales : mapping
         Least possible errors by the name of the scenario. A scenario that is not in `scales` is
         left out of the result.
-    anticipations : mapping
-        `Anticipation` of each controller that acts before set-point changes, by the names of
-        the scenario and the controller.
 
     Returns
     -------
@@ -209,9 +195,7 @@ def estimate(
         - `mean`: the mean error over the runs, degC, an `Estimate`. If runs use random numbers
           and the table has only one run, the ends of the confidence interval are infinite;
         - `ratio`: the error ratio, which is `mean` divided by `limit`, an `Estimate`;
-        - `scores`: an array with the score of each run, shape (members, runs). If the
-          controller anticipates, the scores are from runs with unforeseeable set points;
-        - `mark`: "‡" if the controller anticipates, and otherwise "";
+        - `scores`: an array with the score of each run, shape (members, runs);
         - `difference`: the mean over the runs of the controller's error minus the error of the
           reference controller in the same run (the mean over its members), degC, an `Estimate`;
         - `improvement`: the share of the runs in which the controller's error is smaller than
@@ -236,11 +220,7 @@ def estimate(
                 "mean": mean,
                 "ratio": mean.scaled(1 / scale.least.value),
                 "scores": scale.least.score(errors),
-                "mark": "",
             }
-            if (name, agent) in anticipations:
-                row["scores"] = anticipations[name, agent].scores
-                row["mark"] = "‡"
             if agent != reference and reference in errors_of:
                 reference_errors = errors_of[reference].mean(axis=0)
                 differences = errors - reference_errors

@@ -9,7 +9,6 @@ import pandas as pd
 
 from benchmarks.compare import plots
 from benchmarks.compare.comparison import (
-    Anticipations,
     Result,
     Scale,
     estimate,
@@ -40,18 +39,6 @@ RATIO_TEXT = (
     "before each change of the set point, and that the error in the first row assumes that "
     "each change comes as a surprise. In a case with the mark *, a controller that has learnt "
     "when the set point changes can have an error ratio below 1.00."
-)
-ANTICIPATION_NOTE = (
-    "‡ The controller moves the valve before the square wave changes. Its score in this case "
-    "is the score in runs with the same seeds in which nobody can foresee the changes."
-)
-ANTICIPATION_TEXT = (
-    "The controllers in this table move the valve before the square wave changes. The column "
-    "'moved before the change' has the share of a set-point change that the temperature makes "
-    "before it can respond to the change. The columns 'least possible' and 'with foresight' "
-    "have the least possible errors of controllers that do not know future set points, and of "
-    "controllers that know them. The last column has the error ratio in runs in which nobody "
-    "can foresee the changes."
 )
 DIFFERENCE_TEXT = (
     "The reference is the controller that was named first, here {reference}. A cell has the "
@@ -103,9 +90,6 @@ class Comparison:
         Table with a row for each run in each scenario, like `comparison.Result.runs`.
     estimates : pandas.DataFrame
         Table with a row for each scenario and controller, from `comparison.estimate`.
-    anticipations : mapping
-        `Anticipation` of each controller that acts before set-point changes, by the names of
-        the scenario and the controller.
     misfits : mapping
         Sentences that say why a controller does not fit a plant, by the controller's name.
     scores : mapping
@@ -117,7 +101,6 @@ class Comparison:
     scales: Mapping[str, Scale]
     runs: pd.DataFrame
     estimates: pd.DataFrame
-    anticipations: Anticipations
     misfits: Mapping[str, str]
     scores: Mapping[str, Estimate]
 
@@ -169,13 +152,8 @@ def write(
     runs = runs[runs["scenario"].isin(list(scale_of))]
     if runs.empty:
         return
-    anticipations = {
-        (result.scenario, result.agent): result.anticipation
-        for result in results
-        if result.anticipation is not None
-    }
-    estimates = estimate(runs, scale_of, anticipations)
-    write_numbers(folder / "estimates.csv", estimates.drop(columns=["scores", "mark"]))
+    estimates = estimate(runs, scale_of)
+    write_numbers(folder / "estimates.csv", estimates.drop(columns="scores"))
     plants = [scale.scenario.parameters for scale in scale_of.values()]
     misfits = misfits_of(controllers, plants)
     comparison = Comparison(
@@ -184,7 +162,6 @@ def write(
         scales=scale_of,
         runs=runs,
         estimates=estimates,
-        anticipations=anticipations,
         misfits=misfits,
         scores=ranked(estimates, misfits),
     )
@@ -227,11 +204,6 @@ def sections(comparison: Comparison) -> list[Section]:
             ratio_table(comparison),
         ),
         Section(
-            "Anticipation: controllers that act before the square wave changes",
-            [ANTICIPATION_TEXT],
-            anticipation_table(comparison),
-        ),
-        Section(
             f"Difference to the error of the reference: {reference}",
             [DIFFERENCE_TEXT.format(reference=reference)],
             difference_table(comparison),
@@ -269,7 +241,7 @@ def sections(comparison: Comparison) -> list[Section]:
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Return sentences on controllers that are not ranked, or that anticipate changes.
+    """Return sentences on controllers that are not ranked.
 
     The notes that users' own controllers have, such as a note on a missing environment, come
     first.
@@ -280,8 +252,6 @@ def notes(comparison: Comparison) -> list[str]:
         for policy in result.policies
         if "note" in policy
     }
-    if comparison.anticipations:
-        texts.add(ANTICIPATION_NOTE)
     not_ranked = [
         f"{MISFIT_MARK} {reason} So its error says little about the controller, which is not "
         "ranked."
@@ -310,7 +280,7 @@ def score_table(comparison: Comparison) -> pd.DataFrame:
     estimates = comparison.estimates
     agents = list(comparison.scores)
     cells = estimates["scores"].map(lambda scores: as_text(scores.mean(), ".2f"))
-    table = table_by_agent(estimates, cells + estimates["mark"], agents)
+    table = table_by_agent(estimates, cells, agents)
     travels = comparison.runs.groupby(["agent", "scenario"])["total_variation"].mean()
     overall = []
     for agent, score in comparison.scores.items():
@@ -334,35 +304,9 @@ def ratio_table(comparison: Comparison) -> pd.DataFrame:
         mark = "*" if scale.least.kind == "reference" else ""
         bounds[name] = [f"{scale.least.value:.3f}{mark}", f"{scale.preview:.3f}"]
     estimates = comparison.estimates
-    cells = estimates["ratio"].map("{:.2f}".format) + estimates["mark"]
+    cells = estimates["ratio"].map("{:.2f}".format)
     ratios = table_by_agent(estimates, cells, list(comparison.scores))
     return pd.concat([bounds, ratios], ignore_index=True)
-
-
-def anticipation_table(comparison: Comparison) -> pd.DataFrame:
-    """Return a table of texts on the controllers that act before a square wave changes.
-
-    The table has a row for each scenario and controller in `comparison.anticipations`. The
-    column "moved before the change (%)" has the share of a set-point change that the
-    temperature makes before the temperature can respond to the change.
-    """
-    estimates = comparison.estimates
-    rows = []
-    for estimated in estimates[estimates["mark"] != ""].to_dict("records"):
-        agent = estimated["agent"]
-        anticipation = comparison.anticipations[estimated["scenario"], agent]
-        row = {
-            "case": estimated["scenario"],
-            "controller": label(agent),
-            "moved before the change (%)": f"{anticipation.movement.scaled(100.0):.0f}",
-            "mean error (°C)": f"{estimated['mean'].value:.3f}",
-            "least possible (°C)": f"{estimated['limit']:.3f}",
-            "with foresight (°C)": f"{estimated['preview']:.3f}",
-            "error ratio": f"{estimated['ratio'].value:.2f}",
-            "error ratio without foresight": f"{anticipation.ratio:.2f}",
-        }
-        rows.append(row)
-    return pd.DataFrame(rows)
 
 
 def difference_table(comparison: Comparison) -> pd.DataFrame:
