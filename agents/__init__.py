@@ -5,12 +5,7 @@ from agents.dahlin import DahlinController
 from agents.direct_nn import DirectNNController, Weights
 from agents.networks import Increments, PolicyNetwork
 from agents.pi import PIController
-from agents.recurrent import RecurrentNetwork
-from agents.self_tuning import (
-    NeuralSelfTuningController,
-    NeuralSmithPredictor,
-    SelfTuningController,
-)
+from agents.self_tuning import SelfTuningController
 from agents.smith import SmithPredictor
 
 __all__ = [
@@ -18,11 +13,8 @@ __all__ = [
     "DahlinController",
     "DirectNNController",
     "Increments",
-    "NeuralSelfTuningController",
-    "NeuralSmithPredictor",
     "PIController",
     "PolicyNetwork",
-    "RecurrentNetwork",
     "SelfTuningController",
     "SmithPredictor",
     "Weights",

@@ -58,7 +58,7 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     return np.where(lost_its_effect, outwards, action).astype(np.float32)
 
 
-def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
+def avoid_dead_zone(command: Any, edge: Any) -> Any:
     """Return commands that are 0 or outside the dead zone of the actuator.
 
     A command inside the dead zone is moved to the edge of the dead zone or to 0, whichever is
@@ -67,13 +67,11 @@ def avoid_dead_zone(command: Any, edge: Any, xp: Any = np) -> Any:
     Parameters
     ----------
     command
-        Commands in any unit of flow; an array or a tensor of any shape.
+        Commands in any unit of flow, an array of any shape.
     edge
         Half width of the dead zone in the unit of `command`; a number, or an array that
         broadcasts against `command`.
-    xp
-        Module that computes with `command`: `numpy` for an array, `torch` for a tensor.
     """
-    magnitude = abs(command)
-    edge_or_0 = edge * xp.sign(command) * (magnitude >= edge / 2.0)
-    return xp.where(magnitude < edge, edge_or_0, command)
+    magnitude = np.abs(command)
+    edge_or_0 = edge * np.sign(command) * (magnitude >= edge / 2.0)
+    return np.where(magnitude < edge, edge_or_0, command)

@@ -6,18 +6,18 @@ temperature change that half the flow range causes according to the step test. T
 by the sampling interval. A positive dimensionless flow raises the temperature.
 
 The last axis of every array is the plant. For n plants, an array has for example the shape
-(n,), (time constants, n) or (delays, time constants, n).
+(n,), (time constants, n) or (delays, time constants, n). All plants have the same candidate
+models.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 
@@ -53,38 +53,31 @@ LEAST_NOISE: Final = 0.003
 # variance. A larger mean is clipped before it updates the noise variance, so an outlier has
 # little influence on the noise variance. The log-likelihoods use squares without clipping.
 LARGEST_SQUARE: Final = 16.0
+# Prior standard deviation of the gain, divided by the gain that the step test measured.
+GAIN_SPREAD: Final = 0.25
 GAIN_LIMITS: Final = (0.3, 3.0)  # least and greatest gain, as multiples of the step test's
 # Least value of ln(p / q), for a model's probability p and the greatest probability q.
 LEAST_LOGARITHM: Final = -30.0
 # Samples between updates of the models' gains and probabilities. These updates take the most
 # computing time.
 ESTIMATE_INTERVAL: Final = 2
-LAGS: Final = 4  # number of latest outputs and of latest mean model outputs that a bank keeps
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Candidate models of n plants, and the prior probabilities of the models.
+    """Candidate models of a plant, and the prior probabilities of the models.
 
-    Each plant has one candidate model for every pair of a delay and a time constant.
+    There is one candidate model for every pair of a delay and a time constant.
     """
 
-    time_constants: ArrayLike
-    """Time constants of the models, samples, shape (time constants, n)."""
-    shortest_delays: ArrayLike
-    """Shortest delay d of the models of each plant, in samples, as in equation (28) of the
-    paper, shape (n,). The delays of a plant's models are d, d + 1, d + 2 and so on."""
-    log_probabilities: ArrayLike
-    """Logarithms of the prior probabilities of the models, shape (delays, time constants, n).
-    The probabilities need not sum to 1."""
-    gain_spread: ArrayLike
-    """Prior standard deviation of the gain of each plant, divided by the gain that the step
-    test measured, shape (n,)."""
-
-    def repeated(self, n: int) -> Prior:
-        """Return this prior for n equal plants; `self` must be the prior of one plant."""
-        repeated = {name: np.repeat(values, n, axis=-1) for name, values in vars(self).items()}
-        return Prior(**repeated)
+    time_constants: Array
+    """Time constants of the models, samples, shape (time constants,)."""
+    delays: NDArray[np.intp]
+    """Delays d of the models, in samples, as in equation (28) of the paper: successive integers
+    in rising order, shape (delays,)."""
+    log_probabilities: Array
+    """Logarithms of the prior probabilities of the models, shape (delays, time constants). The
+    probabilities need not sum to 1."""
 
 
 def model_coefficients(time_constants: Array) -> tuple[Array, Array, Array, Array]:
@@ -111,38 +104,29 @@ class UndelayedModels:
     ----------
     time_constants
         Time constants of the models, samples, shape (time constants, n).
-    convert
-        Function that converts NumPy arrays to the arrays with which the models are computed,
-        such as `torch.from_numpy`.
 
     Attributes
     ----------
     outputs
         Outputs s(k) of the models at the present sample k, shape (time constants, n).
-    last_outputs
-        Outputs s(k-1) of the models at the previous sample, shape (time constants, n).
-    last_flow
-        Flow f(k-1) at the previous sample, as a share of half the flow range, shape (n,).
     """
 
-    def __init__(
-        self, time_constants: Array, convert: Callable[[Array], Any] = np.asarray
-    ) -> None:
+    def __init__(self, time_constants: Array) -> None:
         # The factors a1, a2, b1 and b2 in the equation of the models, each of shape (time
         # constants, n).
-        self._coefficients = [convert(values) for values in model_coefficients(time_constants)]
-        self.outputs = convert(np.zeros_like(time_constants))
-        self.last_outputs = self.outputs
-        self.last_flow = convert(np.zeros_like(time_constants[0]))
+        self._coefficients = model_coefficients(time_constants)
+        self.outputs = np.zeros_like(time_constants)
+        self._last_outputs = self.outputs  # s(k-1)
+        self._last_flow = np.zeros_like(time_constants[0])  # f(k-1), shape (n,)
 
-    def advance(self, flow: Any) -> None:
+    def advance(self, flow: Array) -> None:
         """Compute the outputs of the next sample for the present flow f(k), shape (n,)."""
         a1, a2, b1, b2 = self._coefficients
-        next_outputs = a1 * self.outputs + a2 * self.last_outputs
-        next_outputs = next_outputs + b1 * flow + b2 * self.last_flow
-        self.last_outputs = self.outputs
+        next_outputs = a1 * self.outputs + a2 * self._last_outputs
+        next_outputs = next_outputs + b1 * flow + b2 * self._last_flow
+        self._last_outputs = self.outputs
         self.outputs = next_outputs
-        self.last_flow = flow
+        self._last_flow = flow
 
 
 class Whitening:
@@ -194,21 +178,19 @@ class Bank:
     ----------
     prior
         Candidate models and their prior probabilities.
+    n
+        Number of plants.
 
     Attributes
     ----------
-    n : int
-        Number of plants.
-    time_constants, gain_spread : ndarray
-        The fields `time_constants` and `gain_spread` of `prior`, as arrays of float32.
+    models : UndelayedModels
+        The candidate models with gain 1 and without their delays.
     shares : ndarray
         Probabilities of the candidate time constants, shape (time constants, n).
-    delay, delay_spread : ndarray
-        Estimated mean and standard deviation of the delay d, samples, as in equation (28) of
-        the paper, shape (n,).
-    log_constant, log_constant_spread : ndarray
-        Estimated mean and standard deviation of ln(T), for the time constant T in samples,
-        shape (n,).
+    delay : ndarray
+        Estimated mean of the delay d, samples, as in equation (28) of the paper, shape (n,).
+    log_constant : ndarray
+        Estimated mean of ln(T), for the time constant T in samples, shape (n,).
     pole : ndarray
         Estimated mean of the pole exp(-1 / T), for the time constant T in samples, shape (n,).
     fading : ndarray
@@ -217,49 +199,39 @@ class Bank:
     variance : ndarray
         Estimated variance of the models' one-step prediction errors of the whitened output, in
         squared units of the steady temperature change for half the flow range, shape (n,).
-    innovation : ndarray
-        Newest one-step prediction error of the whitened output, as a mean over the models, in
-        units of the steady temperature change for half the flow range, shape (n,).
-    outputs : ndarray
-        Measured outputs at the `LAGS` latest samples, newest first, in units of the steady
-        temperature change for half the flow range, shape (LAGS, n).
     responses : ndarray
-        Outputs s(k - d) of the candidate models with gain 1 at the `LAGS` latest samples k,
-        newest first, as means that are weighted by the probabilities of the models, shape
-        (LAGS, n).
+        Outputs s(k - d) of the candidate models with gain 1 at the present and at the previous
+        sample k, as means that are weighted by the probabilities of the models, shape (2, n).
     """
 
-    def __init__(self, prior: Prior) -> None:
-        self.time_constants = np.asarray(prior.time_constants, np.float32)
-        self.gain_spread = np.asarray(prior.gain_spread, np.float32)
-        self._log_priors = np.asarray(prior.log_probabilities, np.float32)
-        self._shortest_delays = np.asarray(prior.shortest_delays, np.intp)
-        self._delay_count, constant_count, self.n = self._log_priors.shape
-        delays = self._shortest_delays + np.arange(self._delay_count)[:, np.newaxis]
-        self._delays = delays.astype(np.float32)
-        self._log_constants = np.log(self.time_constants)
-        self._poles = np.exp(-1.0 / self.time_constants)
-        self._fading = self._poles ** (self._delays[:, np.newaxis] + 1.0)
-        self._undelayed = UndelayedModels(self.time_constants)
-        self._whiten_output = Whitening((self.n,))
-        self._whiten_response = Whitening((constant_count, self.n))
-        # Ring buffer of the outputs of the models without delay: sample k is in row k modulo
-        # the length. On the second axis, element 0 is the output and element 1 the whitened
-        # output.
-        ring_shape = (int(self._shortest_delays.max()) + 1, 2, constant_count, self.n)
-        self._ring = np.zeros(ring_shape, np.float32)
-        # Delayed outputs s(k - d), in order of the delay d, from the shortest delay on.
-        delayed_shape = (self._delay_count + LAGS - 1, constant_count, self.n)
-        self._delayed = np.zeros(delayed_shape, np.float32)
+    def __init__(self, prior: Prior, n: int) -> None:
+        time_constants = _for_plants(prior.time_constants, n)
+        delays = _for_plants(prior.delays, n)
+        self._delays = delays
+        self._log_constants = np.log(time_constants)
+        self._poles = np.exp(-1.0 / time_constants)
+        self._fading = self._poles ** (delays[:, np.newaxis] + 1.0)
+        self._log_priors = _for_plants(prior.log_probabilities, n)
+        self.models = UndelayedModels(time_constants)
+        self._whiten_output = Whitening((n,))
+        self._whiten_response = Whitening(time_constants.shape)
+        # Outputs s(k) of the models without delay, and whitened outputs, at the latest samples
+        # k, oldest first, as far back as the shortest delay.
+        shortest_delay = int(prior.delays[0])
+        rest = np.zeros_like(time_constants), np.zeros_like(time_constants)
+        self._in_transit = deque([rest] * (shortest_delay + 1), maxlen=shortest_delay + 1)
+        # Outputs s(k - d) in order of the delay d, from the shortest delay on. The last element
+        # is the output of the longest delay at the previous sample.
+        delay_count = len(delays)
+        self._delayed = np.zeros((delay_count + 1, *time_constants.shape), np.float32)
         # The whitened s(k - d) of each model.
         self._regressors = np.zeros_like(self._log_priors)
-        self.outputs = np.zeros((LAGS, self.n), np.float32)
         # Exponentially weighted sums over past samples: squared regressors, regressors times
         # whitened outputs, and log-likelihoods.
         self._information = np.zeros_like(self._log_priors)
         self._products = np.zeros_like(self._log_priors)
         self._log_likelihoods = np.zeros_like(self._log_priors)
-        self.variance = np.full(self.n, FIRST_NOISE**2, np.float32)
+        self.variance = np.full(n, FIRST_NOISE**2, np.float32)
         self._k = 0
         self._renew_estimates()
 
@@ -269,26 +241,18 @@ class Bank:
         `output` is in units of the steady temperature change for half the flow range, shape
         (n,).
         """
-        self.outputs[1:] = self.outputs[:-1]
-        self.outputs[0] = output
         # Shift by one sample: the model with the next longer delay has the same output one
         # sample later.
         self._delayed[1:] = self._delayed[:-1]
         self._regressors[1:] = self._regressors[:-1]
-        rows = (self._k - self._shortest_delays) % len(self._ring)
-        # The index selects a row for each plant, and makes the plants the first axis. The
-        # transposition makes the plants the last axis again.
-        newest = self._ring[rows, :, :, np.arange(self.n)].transpose(1, 2, 0)
-        self._delayed[0], self._regressors[0] = newest
-        self._learn(self._whiten_output(self.outputs[0].copy()))
+        self._delayed[0], self._regressors[0] = self._in_transit[0]
+        self._learn(self._whiten_output(output))
         self._k += 1
         if self._k % ESTIMATE_INTERVAL == 0:
             self._renew_estimates()
-        means = []
-        for lag in range(LAGS):
-            delayed = self._delayed[lag : lag + self._delay_count]
-            means.append(np.einsum("dtn,dtn->n", self._weights, delayed))
-        self.responses = np.stack(means)
+        present = self._mean(self._delayed[:-1])
+        previous = self._mean(self._delayed[1:])
+        self.responses = np.stack([present, previous])
 
     def apply(self, flow: Array) -> None:
         """Update the models with the flow f(k) that leaves the actuator.
@@ -296,11 +260,9 @@ class Bank:
         `flow` is a share of half the flow range, shape (n,). At each sample, call `observe`
         before `apply`.
         """
-        self._undelayed.advance(flow)
-        response = self._undelayed.outputs
-        row = self._k % len(self._ring)
-        self._ring[row, 0] = response
-        self._ring[row, 1] = self._whiten_response(response)
+        self.models.advance(flow)
+        response = self.models.outputs
+        self._in_transit.append((response, self._whiten_response(response)))
 
     def _learn(self, whitened: Array) -> None:
         """Update the noise variance, and the sums that give the gains and probabilities.
@@ -309,14 +271,13 @@ class Bank:
         units of the steady temperature change for half the flow range.
         """
         errors = whitened - self._gains * self._regressors
-        self.innovation = np.einsum("dtn,dtn->n", self._weights, errors)
         squares = np.square(errors)
         self._log_likelihoods *= MODEL_FORGETTING
         self._log_likelihoods -= squares * (0.5 * LIKELIHOOD_FACTOR / self.variance)
         # At the start of an episode, the noise variance is a mean of the first guess
         # FIRST_NOISE^2 and all squared errors so far.
         rate = max(LEAST_NOISE_RATE, 1.0 / (FIRST_NOISE_SAMPLES + self._k))
-        square = np.einsum("dtn,dtn->n", self._weights, squares)
+        square = self._mean(squares)
         square = np.minimum(square, LARGEST_SQUARE * self.variance)
         variance = self.variance + rate * (square - self.variance)
         self.variance = np.maximum(variance, LEAST_NOISE**2).astype(np.float32)
@@ -328,7 +289,7 @@ class Bank:
     def _renew_estimates(self) -> None:
         """Update the gains and probabilities of the models, and the means over the models."""
         # Weight of the prior mean of the gain, 1, in the least squares estimate of the gain.
-        of_prior = self.variance / np.square(self.gain_spread)
+        of_prior = self.variance / GAIN_SPREAD**2
         gains = (self._products + of_prior) / (self._information + of_prior)
         self._gains = np.clip(gains, *GAIN_LIMITS)
         logarithms = self._log_likelihoods + self._log_priors
@@ -337,18 +298,20 @@ class Bank:
         weights /= weights.sum((0, 1))
         self._weights = weights
         self.shares = weights.sum(0)
-        self.delay, self.delay_spread = _moments(weights.sum(1), self._delays)
-        self.log_constant, self.log_constant_spread = _moments(self.shares, self._log_constants)
+        self.delay = (weights.sum(1) * self._delays).sum(0)
+        self.log_constant = (self.shares * self._log_constants).sum(0)
         self.pole = (self.shares * self._poles).sum(0)
-        self.fading = np.einsum("dtn,dtn->n", weights, self._fading)
+        self.fading = self._mean(self._fading)
+
+    def _mean(self, values: Array) -> Array:
+        """Return the mean over the models, weighted by their probabilities, shape (n,).
+
+        `values` has the shape (delays, time constants, n).
+        """
+        mean: Array = np.einsum("dtn,dtn->n", self._weights, values)
+        return mean
 
 
-def _moments(weights: Array, values: Array) -> tuple[Array, Array]:
-    """Return the weighted mean and standard deviation of `values`, each of shape (n,).
-
-    `weights` and `values` have the shape (count, n). For each of the n columns, the weights sum
-    to 1.
-    """
-    mean = (weights * values).sum(0)
-    variance = (weights * np.square(values - mean)).sum(0)
-    return mean, np.sqrt(variance)
+def _for_plants(values: NDArray[Any], n: int) -> NDArray[np.float32]:
+    """Return values of one plant as values of n equal plants, shape (..., n), in float32."""
+    return np.repeat(values[..., np.newaxis].astype(np.float32), n, axis=-1)

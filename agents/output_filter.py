@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from agents.bank import FAST_POLE, GAIN_LIMITS, LIKELIHOOD_FACTOR, NOISE_COLOUR
+from agents.bank import FAST_POLE, GAIN_LIMITS, GAIN_SPREAD, LIKELIHOOD_FACTOR, NOISE_COLOUR
 
 Array = NDArray[np.floating[Any]]
 
@@ -60,28 +60,21 @@ class OutputFilter:
 
     Parameters
     ----------
-    gain_spread
-        Prior standard deviation of the gain, divided by the gain that the step test measured,
-        shape (n,). With a larger `gain_spread`, the filters follow faster changes of the gain.
+    n
+        Number of plants.
 
     Attributes
     ----------
-    gain, gain_spread : ndarray
-        Estimated mean and standard deviation of the gain, divided by the gain that the step
-        test measured, shape (n,).
+    gain : ndarray
+        Estimated gain, divided by the gain that the step test measured, shape (n,).
     load : ndarray
-        Estimated mean of the load disturbance w, in units of the steady temperature change for
-        half the flow range, shape (n,).
-    innovation : ndarray
-        Newest one-step prediction error of the output, as a mean over the Kalman filters, in
-        units of the steady temperature change for half the flow range, shape (n,).
+        Estimated load disturbance w, in units of the steady temperature change for half the
+        flow range, shape (n,).
     weights : ndarray
         Probabilities of the Kalman filters, shape (filters, n).
     """
 
-    def __init__(self, gain_spread: ArrayLike) -> None:
-        spread = np.asarray(gain_spread, np.float64)
-        n = len(spread)
+    def __init__(self, n: int) -> None:
         filters = len(LOAD_CHANGES)
         # At the start of an episode, load disturbance and residual are 0. Only the gain is
         # uncertain. The first axis of the states is the filter, the second the plant, and the
@@ -89,8 +82,7 @@ class OutputFilter:
         self._states = np.zeros((filters, n, 4))
         self._states[:, :, GAIN] = 1.0
         self._covariances = np.zeros((filters, n, 4, 4))
-        self._covariances[:, :, GAIN, GAIN] = np.square(spread)
-        self._gain_changes = np.square(GAIN_CHANGE * spread)
+        self._covariances[:, :, GAIN, GAIN] = GAIN_SPREAD**2
         self._log_likelihoods = np.zeros((filters, n))
         self._response = np.zeros(n)
 
@@ -207,7 +199,7 @@ class OutputFilter:
         eta_variances = np.square(LOAD_CHANGES)[:, np.newaxis, np.newaxis, np.newaxis]
         covariances = xi_variances * np.outer(from_xi, from_xi)
         covariances += eta_variances * (from_eta[:, :, np.newaxis] * from_eta[:, np.newaxis, :])
-        covariances[:, :, GAIN, GAIN] += self._gain_changes
+        covariances[:, :, GAIN, GAIN] += (GAIN_CHANGE * GAIN_SPREAD) ** 2
         return transition, covariances
 
     def _average(self, errors: Array, variances: Array) -> None:
@@ -221,9 +213,6 @@ class OutputFilter:
         self._log_likelihoods -= 0.5 * LIKELIHOOD_FACTOR * losses
         weights = np.exp(self._log_likelihoods - self._log_likelihoods.max(0))
         self.weights = weights / weights.sum(0)
-        self.innovation = (self.weights * errors).sum(0)
         self._mean_state = np.einsum("fn,fni->in", self.weights, self._states)
         self.load = self._mean_state[LOAD]
         self.gain = np.clip(self._mean_state[GAIN], *GAIN_LIMITS)
-        variance = (self.weights * self._covariances[:, :, GAIN, GAIN]).sum(0)
-        self.gain_spread = np.sqrt(np.maximum(variance, 0.0))

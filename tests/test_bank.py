@@ -1,47 +1,25 @@
-"""Test the bank of models, the filter, the hedge and the control law in NumPy and PyTorch."""
-
-from functools import partial
+"""Test the self-tuning controller: its bank of models, its filters and its hedge."""
 
 import numpy as np
 import pytest
-import torch
 
-from agents import (
-    NeuralSelfTuningController,
-    NeuralSmithPredictor,
-    SelfTuningController,
-    output_filter,
+from agents import SelfTuningController, output_filter
+from agents.bank import (
+    FAST_POLE,
+    GAIN_SPREAD,
+    NOISE_COLOUR,
+    Bank,
+    Prior,
+    model_coefficients,
 )
-from agents.bank import FAST_POLE, LAGS, NOISE_COLOUR, Bank, Prior, model_coefficients
 from agents.hedge import RandomSetpoint
-from agents.law import Law, Observer
 from agents.output_filter import LOAD_MEMORY, READING_SHARE, OutputFilter
 from benchmarks.loop.rollout import make_plants, rollout
-from benchmarks.train.neural import Net
 from tests.conftest import STEP_TEST
 
 KNOWN = {**STEP_TEST, "dead_zone": 5.0}
 GAIN, TIME_CONSTANT = -0.6825, 161.0  # of the paper's plant, degC per t/h and s
 DELAY, CONSTANT = 5, 12.0  # samples
-
-
-def lively_net():
-    """Return a network whose corrections of the control law are large."""
-    torch.manual_seed(3)
-    net = Net(nodes=8, hidden=6)
-    with torch.no_grad():
-        net.output.weight.mul_(10.0)
-    return net
-
-
-@pytest.fixture
-def network():
-    return lively_net().export()
-
-
-@pytest.fixture
-def make(network):
-    return partial(NeuralSelfTuningController, **KNOWN, network=network)
 
 
 @pytest.fixture
@@ -51,15 +29,6 @@ def observations(rng):
     errors = 0.3 * setpoints + 0.1 * np.cumsum(rng.normal(size=(120, 3)), axis=0)
     zeros = np.zeros_like(errors)
     return np.stack([setpoints, zeros, zeros, errors], axis=2)
-
-
-def single_model(gain_spread):
-    return Prior(
-        time_constants=[[CONSTANT]],
-        shortest_delays=[DELAY],
-        log_probabilities=[[[0.0]]],
-        gain_spread=[gain_spread],
-    )
 
 
 def simulated(flows):
@@ -99,21 +68,25 @@ def test_the_steady_state_of_the_model_is_that_of_the_step_test():
 
 
 def test_the_response_of_a_single_model_is_that_of_its_difference_equation(rng):
-    bank, flows = Bank(single_model(1e-3)), rng.uniform(-1.0, 1.0, 80)
+    single = Prior(
+        time_constants=np.array([CONSTANT]),
+        delays=np.array([DELAY]),
+        log_probabilities=np.zeros((1, 1)),
+    )
+    bank, flows = Bank(single, 1), rng.uniform(-1.0, 1.0, 80)
     expected = simulated(flows)
     for k, flow in enumerate(flows):
         bank.observe(np.array([expected[k]], np.float32))
         bank.apply(np.array([flow], np.float32))
-    latest = expected[: -LAGS - 1 : -1]
-    assert bank.responses[:, 0] == pytest.approx(latest, abs=1e-5)
+    assert bank.responses[:, 0] == pytest.approx(expected[[-1, -2]], abs=1e-5)
 
 
 class TestOutputFilter:
-    POLE, VARIANCE, SPREAD, SAMPLES = 0.95, 0.04, 0.3, 60
+    POLE, VARIANCE, SAMPLES = 0.95, 0.04, 60
 
     def filtered(self, responses, outputs):
         """Return the filter after all samples of one plant."""
-        kalman = OutputFilter([self.SPREAD])
+        kalman = OutputFilter(1)
         pole, variance = np.array([self.POLE]), np.array([self.VARIANCE])
         for k in range(1, len(outputs)):
             newest = responses[[k, k - 1], np.newaxis]
@@ -122,7 +95,7 @@ class TestOutputFilter:
 
     def test_gain_and_load_are_those_of_all_samples_at_once(self, rng, monkeypatch):
         # The unknowns and the outputs are jointly normal: condition them in one step.
-        change, drift = 0.02, output_filter.GAIN_CHANGE * self.SPREAD
+        change, drift = 0.02, output_filter.GAIN_CHANGE * GAIN_SPREAD
         monkeypatch.setattr(output_filter, "LOAD_CHANGES", np.array([change]))
         monkeypatch.setattr(output_filter, "NOISE_SHARES", np.array([1.0]))
         samples = self.SAMPLES
@@ -141,7 +114,7 @@ class TestOutputFilter:
             of_noise[:, j], of_load[:, j] = noise[:samples], load[:samples]
         s = responses[1:]
         walks = np.minimum.outer(np.arange(1, samples + 1), np.arange(1, samples + 1))
-        gains = self.SPREAD**2 + drift**2 * walks
+        gains = GAIN_SPREAD**2 + drift**2 * walks
         weights = LOAD_MEMORY ** np.arange(samples - 1, -1, -1)  # of eta in the last w
         covariance = (1.0 - READING_SHARE) * self.VARIANCE * of_noise @ of_noise.T
         covariance += change**2 * of_load @ of_load.T + s[:, None] * gains * s
@@ -203,51 +176,8 @@ class TestRandomSetpoint:
         np.testing.assert_array_equal(targets, setpoints)
 
 
-def test_numpy_and_pytorch_choose_the_same_flows(observations):
-    net = lively_net()
-    network = net.export()
-    setpoints, outputs = observations[..., 0] / 7.0, observations[..., 3] / 7.0
-    n = setpoints.shape[1]
-    prior = Prior(
-        time_constants=np.repeat([[14.0], [20.0]], n, axis=1),
-        shortest_delays=np.array([4, 9, 12]),
-        log_probabilities=np.zeros((5, 2, n)),
-        gain_spread=np.full(n, 0.25),
-    )
-    edge, limit = np.full(n, 0.5, np.float32), np.ones(n, np.float32)
-    banks = Bank(prior), Bank(prior)
-    observers = [Observer(bank, edge, (-limit, limit)) for bank in banks]
-    plain = Law(banks[0], edge, (-limit, limit))
-    tensors = Law(banks[1], edge, (-limit, limit), torch, torch.from_numpy)
-    state = network.initial_state(n)
-    net.begin(n)
-
-    def corrections(inputs):
-        nonlocal state
-        outputs, state = network.step(inputs, state)
-        return outputs
-
-    for setpoint, output in zip(setpoints, outputs, strict=True):
-        seen = setpoint.astype(np.float32), output.astype(np.float32)
-        flow = plain.flow(observers[0].observe(*seen), corrections)
-        with torch.no_grad():
-            other = tensors.flow(observers[1].observe(*seen), net).numpy()
-        np.testing.assert_allclose(flow, other, atol=1e-5)
-        for bank in banks:
-            bank.apply(flow)
-    assert np.abs(flow).max() > 0.0
-
-
-def test_loops_of_a_batch_are_those_of_single_controllers(make, observations):
-    batch, singles = make(), [make() for _ in range(3)]
-    for rows in observations:
-        actions = batch.act(rows)
-        alone = [single.act(row) for single, row in zip(singles, rows, strict=True)]
-        np.testing.assert_allclose(actions, alone, atol=1e-4)
-
-
-def test_reset_forgets_the_plant_and_the_network_state(make, observations):
-    controller = make()
+def test_reset_forgets_the_plant(observations):
+    controller = SelfTuningController(**KNOWN)
     first = [controller.act(rows) for rows in observations]
     controller.reset()
     assert controller.estimates == {}
@@ -256,18 +186,16 @@ def test_reset_forgets_the_plant_and_the_network_state(make, observations):
 
 
 @pytest.mark.parametrize("dead_zone", [5.0, 7.0])
-def test_every_command_is_0_or_passes_the_dead_zone(make, observations, dead_zone):
-    controller = make(dead_zone=dead_zone)
+def test_every_command_is_0_or_passes_the_dead_zone(observations, dead_zone):
+    controller = SelfTuningController(**STEP_TEST, dead_zone=dead_zone)
     for rows in observations:
         controller.act(rows)
         size = np.abs(controller.command)
         assert ((size == 0.0) | (size >= dead_zone)).all()
 
 
-@pytest.mark.parametrize("kind", [SelfTuningController, NeuralSelfTuningController])
-def test_huge_observations_lead_to_finite_commands_and_estimates(kind, network, rng):
-    options = {"network": network} if kind is NeuralSelfTuningController else {}
-    controller = kind(**KNOWN, **options)
+def test_huge_observations_lead_to_finite_commands_and_estimates(rng):
+    controller = SelfTuningController(**KNOWN)
     for scale in (1.0, 1e3, 1e6, 1.0):
         for _ in range(60):
             controller.act(rng.normal(size=(3, 6)) * scale)
@@ -289,8 +217,8 @@ def test_neither_a_wrong_gain_nor_a_steady_load_leaves_an_offset():
 class TestScales:
     """Commands do not depend on the units of flow, temperature and time."""
 
-    def commands(self, observations, flow=1.0, temperature=1.0, time=1.0, kind=None, **more):
-        controller = NeuralSmithPredictor(
+    def commands(self, observations, flow=1.0, temperature=1.0, time=1.0):
+        controller = SelfTuningController(
             gain=GAIN * temperature / flow,
             time_constant=TIME_CONSTANT * time,
             delay=STEP_TEST["delay"] * time,
@@ -298,7 +226,6 @@ class TestScales:
             dead_zone=5.0 * flow,
             u_min=-10.0 * flow,
             u_max=10.0 * flow,
-            **more,
         )
         commands = []
         for rows in observations:
@@ -307,15 +234,15 @@ class TestScales:
         return np.array(commands)
 
     @pytest.mark.parametrize("scale", [{"flow": 10.0}, {"temperature": 4.0}, {"time": 0.1}])
-    def test_commands_scale_with_the_units(self, observations, network, scale):
-        plain = self.commands(observations, network=network)
-        scaled = self.commands(observations, network=network, **scale)
+    def test_commands_scale_with_the_units(self, observations, scale):
+        plain = self.commands(observations)
+        scaled = self.commands(observations, **scale)
         np.testing.assert_allclose(scaled, plain, atol=0.01)
 
-    def test_a_slow_plant_is_sampled_less_often(self, observations, network):
-        known = {"network": network, "gain": GAIN, "dead_zone": 5.0}
+    def test_a_slow_plant_is_sampled_less_often(self, observations):
+        known = {"gain": GAIN, "dead_zone": 5.0}
         plain, slow = (
-            NeuralSmithPredictor(time_constant=45.0 * time, delay=19.0 * time, **known)
+            SelfTuningController(time_constant=45.0 * time, delay=19.0 * time, **known)
             for time in (8.0, 32.0)
         )
         for rows in observations:
@@ -323,12 +250,6 @@ class TestScales:
             for _ in range(4):
                 slow.act(rows)
                 np.testing.assert_allclose(slow.command, plain.command, atol=0.01)
-
-
-def test_a_controller_with_a_single_model_accepts_a_long_delay():
-    samples = 20_000  # more than the number of models that a bank can have
-    controller = NeuralSmithPredictor(**{**KNOWN, "delay": 8.0 * samples})
-    assert np.isfinite(controller.act(np.zeros(6))).all()
 
 
 @pytest.mark.parametrize("name", ["delay_range", "setpoint_holds"])

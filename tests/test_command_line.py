@@ -85,8 +85,8 @@ REFUSED = {
         (["pi", "--set", "b=[0.1,-0.1]"], "--plant: the gain must be finite and above 0 for a"),
     ],
     "train": [
-        (["neural", "--set", "delay=9"], "--plant, --preset and --set are for ppo, not for"),
-        (["pi"], '"pi" for NETWORK. Choose from: "neural", "ppo"'),
+        (["ppo-hard", "--set", "delay=9"], "--plant, --preset and --set are for ppo, not for"),
+        (["pi"], '"pi" for NETWORK. Choose from: "ppo", "ppo-hard"'),
     ],
 }  # fmt: skip
 
@@ -111,7 +111,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_run_or_written(
     ("given", "package", "extra"),
     [
         ("datasets", "minari", "data"),
-        ("train neural", "torch", "torch"), ("tune pi", "optuna", "bench"),
+        ("train ppo", "torch", "torch"), ("tune pi", "optuna", "bench"),
         ("claims --backend ray", "ray", "ray"),
     ],
 )  # fmt: skip

@@ -224,7 +224,7 @@ class TestReport:
     def test_on_screen_nothing_is_cut(self, width, monkeypatch):
         monkeypatch.setenv("COLUMNS", str(width))
         cells = {f"square-dead-zone-{i}": ["1.00 (0.99 to 1.01)", "11.5"] for i in range(7)}
-        table = pd.DataFrame({"agent": ["neural self-tuning", "NN (1992)"], **cells})
+        table = pd.DataFrame({"agent": ["self-tuning", "NN (1992)"], **cells})
         shown = on_screen(table)
         assert width / 2 < max(map(len, shown.splitlines())) <= width
         assert shown.count("11.5") == shown.count("1.00 (0.99 to 1.01)") == 7
@@ -433,7 +433,7 @@ class TestCompare:
         assert pictured(few) == few
         assert pictured(few, ["nn"]) == ["mpc", "self-tuning"]
         assert pictured(few, few) == few
-        chosen = {"nn", "pi", "dahlin", "ppo", "neural-smith"}
+        chosen = {"nn", "pi", "dahlin", "ppo"}
         assert set(pictured(list(ROSTER))) == chosen
         assert set(pictured(list(ROSTER), ["pi"])) == chosen - {"pi"}
 

@@ -1,6 +1,7 @@
 """The roster: what holds for any controller, as every command runs it; and a user's own."""
 
 import copy
+import pickle
 import re
 
 import gymnasium
@@ -14,7 +15,7 @@ from benchmarks.compare.comparison import run_case
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.errors import UsageError
-from benchmarks.loop.rollout import mean_error
+from benchmarks.loop.rollout import make_plants, mean_error
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
@@ -78,6 +79,21 @@ def test_a_batch_is_its_members_again_and_mirrored(entry, member):
     np.testing.assert_allclose(mirrored.command, -batch.command, atol=1e-2)
     if entry.name != "idle":
         assert (batch.command > 9.99).any()  # the limits, and anti-windup, had a part
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda a: pickle.loads(pickle.dumps(a))])
+def test_a_copy_in_mid_episode_goes_on_like_the_original(member, copied):
+    plant = {**PRESETS["hard"], **member.observation}
+    plants = make_plants(3, 80, **plant)
+    controller = member.make(PRESETS["hard"], 3, 5)
+    observations, _ = plants.reset(seed=5)
+    for k in range(80):
+        if k == 40:
+            twin = copied(controller)
+        action = controller.act(observations)
+        if k >= 40:
+            np.testing.assert_array_equal(twin.act(observations), action)
+        observations, *_ = plants.step(action)
 
 
 def test_it_asks_for_its_own_windows(member):
@@ -255,10 +271,3 @@ class TestSavedPolicies:
     def test_what_is_refused(self, location, complaint, zips):
         with pytest.raises(ValueError, match=complaint):
             members_of(location.format(zips))[0].run({}, 2, 2, 0)
-
-
-def test_a_comparison_of_cases_runs_one_of_the_networks_that_are_alike():
-    for name, count in (("neural-smith", 1), ("neural-self-tuning", 1), ("ppo", 5), ("pi", 1)):
-        members = ROSTER[name].with_few_networks().members()
-        assert len(members) == count
-        assert members[0].provenance == ROSTER[name].members()[0].provenance

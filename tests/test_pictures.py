@@ -21,10 +21,10 @@ def ticks(axis):
 
 class TestFindings:
     def test_of_scores(self):
-        scores = {"mpc": 0.998, "neural-smith": 0.9971, "mine": 0.9, "pi": -0.0001}
+        scores = {"mpc": 0.998, "smith": 0.9971, "mine": 0.9, "pi": -0.0001}
         estimates = {agent: Estimate(x, x, x, 1) for agent, x in scores.items()}
         assert plots.scores_finding(estimates) == (
-            "MPC has the highest score (0.998), neural Smith the second highest (0.997), "
+            "MPC has the highest score (0.998), Smith the second highest (0.997), "
             "and PI (1992) the lowest (0.000)"
         )
         assert plots.scores_finding({"mine": estimates["mine"]}) == "mine has a score of 0.900"

@@ -1,4 +1,4 @@
-"""Training: through the plant, what is differentiated and chosen; by PPO, what groups share."""
+"""Training by PPO: what groups of plants share, and what a file of a policy holds."""
 
 import json
 from dataclasses import asdict, replace
@@ -9,28 +9,18 @@ import pytest
 import torch
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from agents import PolicyNetwork, RecurrentNetwork
+from agents import PolicyNetwork
 from agents.networks import PRETRAINED
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.examples import sb3
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.train import __main__ as program
-from benchmarks.train import neural, ppo
-from benchmarks.train.neural import (
-    Loops,
-    Net,
-    Training,
-    chance_of_change,
-    expected_error,
-    mean_distance,
-)
-from benchmarks.train.plants import HOLD_TIMES, Sampler, environment
+from benchmarks.train import ppo
 from mptc_gym import Parameters
 from mptc_gym.wrappers.vector import IncrementalAction
 from tests.conftest import ROOT
 
-SMALL = Training(steps=2, plants=4, segment=60, nodes=3, hidden=2, validation_episodes=2)
 RECIPE = replace(
     ppo.RECIPES["ppo"],
     plants=(
@@ -50,91 +40,16 @@ def small(monkeypatch):
         monkeypatch.setitem(sb3.SETTINGS, name, value)
 
 
-class TestExpectedError:
-    def test_it_is_the_mean_of_what_happens(self):
-        # Of plants like those of `hard`, in which nothing was chosen by the draw.
-        batch = Sampler(400, 1.0, seed=1).batch()
-        net = Net(nodes=2, hidden=2)
-        with torch.no_grad():
-            outputs, factors = Loops(environment(400), batch, net, seed=1).run(400)
-            expected = expected_error(outputs, batch, factors, 1)
-        errors = (batch.setpoints[1:401] - outputs).abs()
-        reached = torch.arange(1, 401)[:, None] > batch.numbers["delay"]
-        assert expected.item() == pytest.approx(errors[reached].mean().item(), rel=0.03)
-
-    def test_changes_have_the_chance_that_the_environment_gives_them(self):
-        lengths = np.arange(HOLD_TIMES[0], HOLD_TIMES[1] + 1)
-        for age, samples in ((0, 19), (85, 19), (150, 25), (270, 19), (299, 13)):
-            left = lengths[lengths > age]
-            share = (left <= age + samples).mean()
-            chance = chance_of_change(torch.tensor([float(age)]), torch.tensor([samples]))
-            assert chance.item() == pytest.approx(share, abs=1e-6)
-
-    def test_the_distance_is_that_of_a_sample(self):
-        noise = torch.randn(200_000, generator=torch.Generator().manual_seed(0))
-        for distance, deviation in ((0.0, 1.0), (0.7, 0.5), (-2.0, 0.1)):
-            mean = mean_distance(torch.tensor(distance), torch.tensor(deviation))
-            sampled = (distance + deviation * noise).abs().mean()
-            assert mean.item() == pytest.approx(sampled.item(), rel=0.01)
-
-
-class TestSampler:
-    def test_an_exact_step_test_leaves_one_model(self):
-        batch = Sampler(200, 0.0, seed=2).batch()
-        prior, delays = batch.prior, batch.numbers["delay"].numpy()
-        exact = prior.gain_spread < 0.01
-        assert 0.3 < exact.mean() < 0.7
-        likely = prior.log_probabilities[:, :, exact] > -100.0
-        assert (likely.sum((0, 1)) == 1).all()
-        place = likely.any(1).argmax(0)
-        np.testing.assert_array_equal(prior.shortest_delays[exact] + place, delays[exact])
-
-    def test_set_points_of_others_are_held_longer_than_any_of_hard(self):
-        batch = Sampler(100, 0.0, seed=3).batch()
-        changes = (batch.setpoints.diff(dim=0) != 0.0).nonzero()
-        for plant in range(100):
-            times = changes[changes[:, 1] == plant, 0]
-            assert (times.diff() > HOLD_TIMES[1]).all()
-
-
-def test_a_seed_gives_a_network_that_differs_from_that_of_another():
-    first, again, other = (neural.train(SMALL, seed).weights for seed in (0, 0, 1))
-    for name, values in first.items():
-        np.testing.assert_array_equal(values, again[name])
-    assert not np.array_equal(first["output_biases"], other["output_biases"])
-
-
-def test_those_of_the_project_are_of_the_recipe():
-    members = ROSTER["neural-self-tuning"].members()
-    files = [member.provenance["file"] for member in members]
-    assert files == [f"neural-{seed}.npz" for seed in range(10_000, 10_005)]
-    recipe = json.loads(json.dumps(asdict(neural.RECIPES["neural"])))
-    for file in files:
-        network = RecurrentNetwork.load(PRETRAINED / file)
-        assert network.provenance["training"] == recipe
-        count = sum(values.size for values in network.weights.values())
-        assert f"{count:,} weights" in ROSTER["neural-smith"].searched
-
-
-@pytest.mark.parametrize(
-    ("network", "steps", "files"),
-    [("neural", 2, {"neural-10000", "neural-10001"}), ("ppo", 8, {"ppo-10000", "ppo-10001"})],
-)
-def test_the_command_lists_trainings_by_their_seeds(
-    network, steps, files, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.setitem(neural.RECIPES, "neural", SMALL)
+def test_the_command_lists_trainings_by_their_seeds(tmp_path, capsys, monkeypatch):
     short = {
         "plants": (ppo.TrainingPlants(64, {}),),
         "cases": {"short": {"max_episode_steps": 20}},
     }
     monkeypatch.setitem(ppo.RECIPES, "ppo", replace(ppo.RECIPES["ppo"], **short))
-    arguments = [network, "--networks", "2", "--steps", str(steps), "--jobs", "1"]
-    assert program.main([*arguments, "--out", str(tmp_path)]) == 0
-    shown = capsys.readouterr().out
-    assert {"10000", "10001"} <= set(shown.split())
-    folder = tmp_path / network
-    assert {file.stem for file in folder.glob("*.npz")} == files
+    arguments = ["ppo", "--networks", "2", "--steps", "8", "--jobs", "1", "--out"]
+    assert program.main([*arguments, str(tmp_path)]) == 0
+    assert {"10000", "10001"} <= set(capsys.readouterr().out.split())
+    assert {file.stem for file in tmp_path.glob("ppo/*.npz")} == {"ppo-10000", "ppo-10001"}
 
 
 def weights(network):

@@ -60,10 +60,6 @@ def work(options: Options) -> str:
     from benchmarks.compare.report import write
 
     controllers = chosen(options.agents, options.controllers.agent)
-    if not options.presets:
-        controllers = {
-            name: controller.with_few_networks() for name, controller in controllers.items()
-        }
     folder_name, scenarios = cases(options)
     target = options.out or Path("results", folder_name)
     provenance = origin()

@@ -14,11 +14,8 @@ from typing import Any
 from agents import (
     DahlinController,
     DirectNNController,
-    NeuralSelfTuningController,
-    NeuralSmithPredictor,
     PIController,
     PolicyNetwork,
-    RecurrentNetwork,
     SelfTuningController,
     SmithPredictor,
 )
@@ -33,7 +30,6 @@ from benchmarks.controllers.spec import (
     EVERYTHING,
     LIMITS,
     ROBUSTNESS,
-    SETPOINT,
     STEP_TEST,
     ControllerSpec,
 )
@@ -48,15 +44,13 @@ LAMBDA = 0.1
 OWN_LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d")
 
 
-def with_bank(
-    kind: type[SelfTuningController], *, widest_dead_zone: float, **prior_knowledge: Any
-) -> SelfTuningController:
-    """Return a self-tuning controller, which selects the best of a bank of plant models.
+def self_tuning(*, widest_dead_zone: float, **prior_knowledge: Any) -> Agent:
+    """Return a self-tuning controller that assumes the largest dead zone of the plant.
 
-    The controller assumes the dead zone `widest_dead_zone`, the largest half width of the dead
-    zone that the plant can have, t/h.
+    `widest_dead_zone` is the largest half width of the dead zone that the plant can have, t/h,
+    and `prior_knowledge` are all further arguments of `SelfTuningController`.
     """
-    return kind(dead_zone=widest_dead_zone, **prior_knowledge)
+    return SelfTuningController(dead_zone=widest_dead_zone, **prior_knowledge)
 
 
 def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
@@ -95,13 +89,13 @@ def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -
     return replace(network, increments=increments, **limits)
 
 
-def trained(kind: type[PolicyNetwork | RecurrentNetwork], files: str) -> Mapping[str, Any]:
-    """Return trained networks of the class `kind`, by the name of the network's file.
+def trained(files: str) -> Mapping[str, PolicyNetwork]:
+    """Return trained policies, by the name of the policy's file.
 
     The files lie in the folder `agents/pretrained`, and have names that match the pattern
     `files`, such as "ppo-*.npz".
     """
-    return {file.name: kind.load(file) for file in PRETRAINED.glob(files)}
+    return {file.name: PolicyNetwork.load(file) for file in PRETRAINED.glob(files)}
 
 
 # Texts for reports: what a controller knows, and how the controller was searched or trained. In
@@ -114,11 +108,7 @@ _NN_SEARCH = (
     "takes 800 trials: 566 M samples, 6 min"
 )
 _KNOWS_HOLDS = "hold times of random set points"
-_NETWORK_TRAINING = (
-    "8,313 weights for all plants: 12.8 M samples a network, 5 min; 90 settings by hand"
-)
 _TUNING_RULE = f"one time constant, by a tuning rule and an Ms of {ROBUSTNESS:g}; one step test"
-_NETWORKS = partial(trained, RecurrentNetwork, "neural-[0-9]*.npz")
 _SPECS = (
     ControllerSpec(
         name="idle",
@@ -218,7 +208,7 @@ _SPECS = (
         name="self-tuning",
         label="self-tuning",
         look=("#5FCF9F", "v"),
-        build=partial(with_bank, SelfTuningController),
+        build=self_tuning,
         prior_knowledge=BANK,
         knows=f"{_KNOWS_DATA_SHEET}; delay range; {_KNOWS_HOLDS}",
         searched="about 70 settings by hand; one step test",
@@ -242,7 +232,7 @@ _SPECS = (
         searched="388 weights on the paper's plant: 5 M samples a policy; settings by 79 "
         "trials: 121 M samples, 30 min",
         assumes=("direction", "scale"),
-        networks=partial(trained, PolicyNetwork, "ppo-[0-9]*.npz"),
+        networks=partial(trained, "ppo-[0-9]*.npz"),
         pictured=True,
     ),
     ControllerSpec(
@@ -256,30 +246,7 @@ _SPECS = (
         "trials: 36 M samples, 12 min",
         assumes=("direction", "scale"),
         made_for=PRESETS["hard"],
-        networks=partial(trained, PolicyNetwork, "ppo-hard-*.npz"),
-    ),
-    ControllerSpec(
-        name="neural-smith",
-        label="neural Smith",
-        look=("#0072B2", "^"),
-        build=NeuralSmithPredictor,
-        prior_knowledge=(*DATA_SHEET, *SETPOINT),
-        knows=f"{_KNOWS_DATA_SHEET}; {_KNOWS_HOLDS}",
-        searched=f"{_NETWORK_TRAINING}; one step test",
-        networks=_NETWORKS,
-        networks_are_alike=True,
-        pictured=True,
-    ),
-    ControllerSpec(
-        name="neural-self-tuning",
-        label="neural self-tuning",
-        look=("#005A3C", "v"),
-        build=partial(with_bank, NeuralSelfTuningController),
-        prior_knowledge=BANK,
-        knows=f"{_KNOWS_DATA_SHEET}; delay range; {_KNOWS_HOLDS}",
-        searched=f"{_NETWORK_TRAINING}; one step test",
-        networks=_NETWORKS,
-        networks_are_alike=True,
+        networks=partial(trained, "ppo-hard-*.npz"),
     ),
 )
 
@@ -288,8 +255,6 @@ ROSTER = {spec.name: spec for spec in _SPECS}
 
 RENAMED = {
     "nothing": "idle",
-    "nn-smith": "neural-smith",
-    "nn-self-tuning": "neural-self-tuning",
 }
 """The present names of controllers by their names in earlier versions."""
 

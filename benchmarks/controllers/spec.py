@@ -137,9 +137,6 @@ class ControllerSpec:
     networks : callable, optional
         Function that returns the controller's trained networks by file name. A member of the
         controller is the controller with one of the networks; commands run all members.
-    networks_are_alike : bool
-        Whether the trained networks of the controller hardly differ, so that most comparisons
-        run only one of them.
     random : bool
         Whether the controller draws random numbers, such as initial weights.
     learns : bool
@@ -170,7 +167,6 @@ class ControllerSpec:
     made_for: Mapping[str, Any] = field(default_factory=dict)
     observation: Mapping[str, int] = field(default_factory=lambda: PAPER_WINDOWS)
     networks: Callable[[], Mapping[str, Any]] | None = None
-    networks_are_alike: bool = False
     random: bool = False
     learns: bool = False
     spans: Callable[[Parameters], plant_scale.Spans] | None = None
@@ -196,21 +192,6 @@ class ControllerSpec:
             )
             members.append(member)
         return members
-
-    def with_few_networks(self) -> "ControllerSpec":
-        """Return a `ControllerSpec` with the first network only, if the networks are alike.
-
-        A controller without networks, or with networks that differ, is returned unchanged.
-        """
-        networks = self.networks
-        if networks is None or not self.networks_are_alike:
-            return self
-
-        def first_network() -> dict[str, Any]:
-            file, network = min(networks().items())
-            return {file: network}
-
-        return replace(self, networks=first_network)
 
     def with_gains(self, gains: Mapping[str, Any]) -> "ControllerSpec":
         """Return a copy in which arguments of `build`, by name, have the fixed values `gains`.

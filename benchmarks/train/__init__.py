@@ -1,1 +1,1 @@
-"""Train the neural networks that come with the project."""
+"""Train the policies that come with the project."""

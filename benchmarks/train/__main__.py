@@ -1,12 +1,12 @@
-"""Train the neural controllers: `python -m benchmarks.train --help`."""
+"""Train policies by PPO: `python -m benchmarks.train --help`."""
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
+from agents import PolicyNetwork
 from benchmarks.lib.command import Count, Folder, Parameter, command, options
 from benchmarks.lib.errors import UsageError
 from benchmarks.lib.parallel import FanOut
@@ -15,14 +15,13 @@ from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.scenarios import PlantOptions
 
 SEED = SEEDS["networks"].first  # seed of the first network; network i has the seed SEED + i
-# For each kind of network, the module of `benchmarks.train` that has its recipe.
-NETWORKS = {"neural": "neural", "ppo": "ppo", "ppo-hard": "ppo"}
+NETWORKS = "ppo", "ppo-hard"
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Train the neural controllers by gradients through simulated plants, or by PPO.
+    """Train policies by PPO on simulated plants.
 
     After an interruption, the same command with the same code trains only the networks that are
     still missing.
@@ -35,8 +34,8 @@ class Options:
     written, and none is chosen by its result."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     steps: Count | None = None
-    """The length of a training: steps of the optimiser or, for PPO, samples of experience
-    (default: as for the published networks)."""
+    """The length of a training, samples of experience (default: as for the published
+    networks)."""
     out: Folder = Path("results/networks")
     fan_out: FanOut = field(default_factory=FanOut)
 
@@ -46,16 +45,17 @@ def work(options: Options) -> str:
 
     A `UsageError` is raised if the options name a plant for a network other than "ppo".
     """
+    from benchmarks.train import ppo
+
     name = options.network
-    module = importlib.import_module(f"benchmarks.train.{NETWORKS[name]}")
-    recipe = module.RECIPES[name]
-    train = module.train
+    recipe = ppo.RECIPES[name]
+    train = ppo.train
     stem = name  # beginning of the names of the files
     if options.plant.name:
         if name != "ppo":
             raise UsageError(f"--plant, --preset and --set are for ppo, not for {name}")
         plant = options.plant.arguments()
-        recipe = module.for_plant(plant)
+        recipe = ppo.for_plant(plant)
         train = partial(train, plant=plant)
         stem = "ppo-plant"
     if options.steps:
@@ -64,7 +64,7 @@ def work(options: Options) -> str:
     tasks = {f"seed {seed}": partial(train, recipe, seed) for seed in seeds}
     target = options.out / stem
     with results_folder(target, conditions_of("train", options)) as folder:
-        kept = KeptResults(folder, save_network, module.load)
+        kept = KeptResults(folder, save_network, PolicyNetwork.load)
         trained = dict(options.fan_out.stream(tasks, "training", kept))
         networks = {seed: trained[f"seed {seed}"] for seed in seeds}
         show_validation(networks)
@@ -74,12 +74,12 @@ def work(options: Options) -> str:
     return f"Written to {target}: {', '.join(files.values())}"
 
 
-def save_network(path: Path, network: Any) -> None:
+def save_network(path: Path, network: PolicyNetwork) -> None:
     """Save `network` in the file `path`."""
     network.save(path)
 
 
-def show_validation(networks: Mapping[int, Any]) -> None:
+def show_validation(networks: Mapping[int, PolicyNetwork]) -> None:
     """Print a table with the validation results of trained networks, a row for each network.
 
     The keys of `networks` are the seeds of the trainings.

@@ -32,8 +32,6 @@ from mptc_gym.wrappers.vector import IncrementalAction
 
 Array = NDArray[np.float64]
 
-load = PolicyNetwork.load
-
 TRAINING_SEEDS = SEEDS["training"].first  # least seed of the training plants
 # Change of the flow per sample at an action of 1, as a share of half the actuator's range: with
 # 2.0, the flow can cross the entire range in a sample.
