@@ -12,7 +12,7 @@ from agents.hedge import RandomSetpoint
 from benchmarks.bounds import __main__ as command
 from benchmarks.bounds.__main__ import main
 from benchmarks.bounds.causal import SetPointLaw
-from benchmarks.bounds.least import least_possible, with_hidden_load
+from benchmarks.bounds.least import least_possible
 from benchmarks.bounds.linear_program import equations, plan, reference, response
 from benchmarks.bounds.prediction import noise_variance
 from benchmarks.bounds.unknown import error_bounds, load_changes
@@ -20,7 +20,7 @@ from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
-from mptc_gym import PRESETS, Parameters
+from mptc_gym import Parameters
 from mptc_gym.plant.dynamics import action_from_command
 from tests.verify_bounds import CONTROLLERS, beats, errors
 
@@ -290,18 +290,6 @@ class TestLeastPossible:
         }.items():
             with pytest.raises(ValueError, match=message):
                 least_possible(**{"samples": 600, **arguments})
-
-
-def test_a_hidden_load_costs_more_than_one_that_is_seen():
-    disturbed = {**PRESETS["disturbed"], "setpoint": 5.0}
-    least = least_possible(samples=300, **disturbed)
-    assert 1.03 < with_hidden_load(samples=300, **disturbed).value / least.value < 1.15
-    # Without noise the output shows the load, and without load there is nothing to hide.
-    visible_load = {"setpoint": 5.0, "disturbance_amplitude": 1.5}
-    for arguments in (visible_load, {"setpoint": 5.0, "noise_variance": 0.5}):
-        estimate = with_hidden_load(samples=300, **arguments)
-        least = least_possible(samples=300, **arguments)
-        assert estimate.value == pytest.approx(least.value, abs=1e-4)
 
 
 class TestHedging:

@@ -24,7 +24,6 @@ from mptc_gym.evaluation import (
 
 # Heading of the table's column for each kind of least possible error.
 HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
-HIDDEN_LOAD = "hidden load (estimate)"
 # Explanation of each column of the table, by heading, in the order of the columns.
 COLUMNS = {
     "idle valve": "the error if the flow stays at 0 t/h.",
@@ -42,11 +41,6 @@ COLUMNS = {
         "and does not expect the change. The reference is not a lower bound: a controller that "
         "knows the times of the changes can have a smaller error. If the set point never "
         'changes, the reference equals the bound "with preview".'
-    ),
-    HIDDEN_LOAD: (
-        "an estimate of the least error of controllers that see the load only in the readings "
-        "of the transmitter. The bounds and the reference assume that the controller knows the "
-        "present load. The estimate is not a bound."
     ),
     "MPC": (
         "the error of model predictive control, which knows the plant, but neither the load "
@@ -131,11 +125,10 @@ def description() -> str:
 def row(case: Scenario, options: Options) -> dict[str, str]:
     """Return a case's row of the printed table: mean errors, degC, as texts by column heading.
 
-    The returned text is "" for the column "without preview" if set points are not random, for
-    the column "reference" if the set point changes before the plant has settled, and for the
-    column "hidden load (estimate)" if the case has no load.
+    The returned text is "" for the column "without preview" if set points are not random, and
+    for the column "reference" if the set point changes before the plant has settled.
     """
-    from benchmarks.bounds.least import least_possible, with_hidden_load
+    from benchmarks.bounds.least import least_possible
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.lib.statistics import bootstrap
     from benchmarks.loop.rollout import mean_error
@@ -154,9 +147,6 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
         cells[heading] = ""
         with suppress(NoBoundError):
             cells[heading] = f"{least_possible(kind=kind, **arguments):.4f}"
-    cells[HIDDEN_LOAD] = ""
-    if case.parameters.is_disturbed:
-        cells[HIDDEN_LOAD] = f"{with_hidden_load(**arguments):.4f}"
     if options.mpc:
         runs = ROSTER["mpc"].run(case.arguments, samples, options.mpc, options.seed)
         cells["MPC"] = f"{bootstrap(mean_error(runs), seed=0):.4f}"

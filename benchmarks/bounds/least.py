@@ -11,7 +11,7 @@ No controller knows the time at which the load jumps next. A controller may comp
 dead zone of the actuator.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -21,11 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.bounds.causal import SetPointLaw
-from benchmarks.bounds.hidden import bounds_with_hidden_load, bounds_with_known_load
 from benchmarks.bounds.linear_program import (
     LOOKAHEAD,
     TRAVEL_PRICE,
-    ErrorBounds,
     plan,
     reference,
 )
@@ -158,30 +156,6 @@ def least_possible(
         return _bound(*case, "preview")
 
 
-def with_hidden_load(
-    *, samples: int, episodes: int = EPISODES, seed: int = SEED, **arguments: Any
-) -> Estimate:
-    """Return an estimate of the least possible mean |e(k)| if the load is not measured, degC.
-
-    The estimate for a hidden load, which `hidden.py` derives, is not a lower bound. If the
-    plant has no load, the least possible error is returned. The parameters and exceptions are
-    those of `least_possible` without the parameter `kind`.
-    """
-    least = least_possible(samples=samples, episodes=episodes, seed=seed, **arguments)
-    parameters = Parameters(**arguments)
-    if not parameters.is_disturbed:
-        return least
-    sampled = _episodes_of(parameters, samples, len(least.episodes), seed)
-    estimates = []
-    for i, bound in enumerate(least.episodes):
-        # The arguments of `_error_sum` before `bounds_of`.
-        episode = parameters, least.kind, sampled.numbers[i], sampled.setpoints[i]
-        hidden_load = _error_sum(*episode, bounds_with_hidden_load)
-        known_load = _error_sum(*episode, bounds_with_known_load)
-        estimates.append(bound + (hidden_load - known_load) / samples)
-    return student(estimates)
-
-
 class _Episodes(NamedTuple):
     """Plants and set points of several episodes, and the mean errors of an idle valve."""
 
@@ -233,11 +207,7 @@ def _bound(
 
 
 def _error_sum(
-    parameters: Parameters,
-    kind: str,
-    numbers: PlantNumbers[float],
-    setpoint: Array,
-    bounds_of: Callable[[LinearModel], ErrorBounds] = error_bounds,
+    parameters: Parameters, kind: str, numbers: PlantNumbers[float], setpoint: Array
 ) -> float:
     """Return the least possible sum of |e(k)| over k = 1 to N in one episode, degC.
 
@@ -247,14 +217,13 @@ def _error_sum(
     on the sum of errors and price, but not on the sum of errors alone.
 
     `numbers` has the parameter values of the episode's plant, and `setpoint` has the set points
-    y_d(k) for k = 0 to N, degC. The function `bounds_of` returns lower bounds of the mean error
-    at each sample for a model of the plant.
+    y_d(k) for k = 0 to N, degC.
     """
     length = len(setpoint)
     if kind == "reference":  # A reference can plan beyond the end.
         length += int(numbers.delay) + len(parameters.b) + LOOKAHEAD
     model = LinearModel(parameters, numbers, np.arange(length))
-    bounds = bounds_of(model)
+    bounds = error_bounds(model)
     if kind == "reference":
         errors, flow = reference(model, bounds, setpoint)
         costs = TRAVEL_PRICE * np.abs(np.diff(flow, prepend=0.0))

@@ -24,21 +24,11 @@ def noise_variance(model: LinearModel) -> Array:
     episode. The load of the plant counts as 0.
     """
     F, Q = noise_system(model)
-    return predicted_variance(noise_covariance(model), F, Q, model.lag)
-
-
-def noise_covariance(model: LinearModel) -> Array:
-    """Return the covariances of a plant's state x(k), given the readings up to k.
-
-    The state x(k), which `noise_system` describes, has the latest outputs of the plant and the
-    latest values of the noise. The result has a covariance matrix for each sample k of an
-    episode, shape (samples, size, size), where size is the length of the state. The covariances
-    are 0 if the transmitter has no noise. The load of the plant counts as 0.
-    """
-    F, Q = noise_system(model)
-    if model.numbers.measurement_noise_variance == 0.0:
-        return np.zeros_like(F)
-    return filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
+    reading_variance = model.numbers.measurement_noise_variance
+    filtered = np.zeros_like(F)  # Readings without noise show the state.
+    if reading_variance > 0.0:
+        filtered = filtered_covariance(F, Q, reading_variance)
+    return predicted_variance(filtered, F, Q, model.lag)
 
 
 def noise_system(model: LinearModel) -> tuple[Array, Array]:
