@@ -12,7 +12,7 @@ import torch
 from stable_baselines3 import PPO
 
 import mptc_gym.sb3
-from benchmarks.examples import recurrent, through_plant
+from benchmarks.examples import recurrent
 from mptc_gym import evaluate
 from mptc_gym.sb3 import load, spec_of
 from tests.conftest import ROOT
@@ -75,7 +75,3 @@ def test_the_notebook_runs_and_shows_what_it_showed(capsys, monkeypatch):
         assert printed[:4] == "".join(stored).splitlines()[:4]  # the lines before any training
     assert printed[4].startswith("PPO")
     plt.close("all")
-
-
-def test_one_trained_through_the_plant_learns_in_a_few_steps():
-    assert through_plant.main(6, 16, 200).mean_error < 1.5  # the paper's PI controller has 2.26
