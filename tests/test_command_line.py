@@ -49,7 +49,7 @@ def test_help_imports_nothing_heavy():
         assert clutter not in done.stdout
     assert "default: 100]" in done.stdout
     # Names are not broken between lines.
-    assert {"nn-frozen", "square-dead-zone-7"} <= {*re.split(r"[\s,]+", done.stdout)}
+    assert {"pi-searched", "square-dead-zone-7"} <= {*re.split(r"[\s,]+", done.stdout)}
 
 
 REFUSED = {

@@ -421,7 +421,7 @@ class TestCompare:
             assert comparison.misfits_of(ROSTER, [plant]) == {}
         slow = Parameters(delay=40)  # 41 samples in place of 19
         assert set(comparison.misfits_of(ROSTER, [slow])) == {
-            "nn", "nn-frozen", "pi", "pi-searched", "ppo", "ppo-hard",
+            "nn", "pi", "pi-searched", "ppo", "ppo-hard",
         }  # fmt: skip
 
     def test_few_controllers_are_all_pictured_and_of_many_the_chosen_ones(self):

@@ -7,7 +7,7 @@ gains of each controller whose record has `spans`. The option `--agent NAME=MODU
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -51,17 +51,6 @@ def self_tuning(*, widest_dead_zone: float, **prior_knowledge: Any) -> Agent:
     and `prior_knowledge` are all further arguments of `SelfTuningController`.
     """
     return SelfTuningController(dead_zone=widest_dead_zone, **prior_knowledge)
-
-
-def frozen_nn(parameters: Parameters, num_envs: int, seed: int) -> Agent:
-    """Return the paper's neural controller, trained on a plant and then frozen.
-
-    The controller has a network for each of `num_envs` runs. The initial weights of the network
-    of run i have the seed `seed + i`. `parameters` are the arguments of the environment.
-    """
-    controller: Any = ROSTER["nn"].in_service(asdict(parameters), num_envs, seed)
-    controller.learning = False
-    return controller  # type: ignore[no-any-return]
 
 
 def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
@@ -133,18 +122,6 @@ _SPECS = (
         learns=True,
         spans=plant_scale.nn_spans,
         pictured=True,
-    ),
-    ControllerSpec(
-        name="nn-frozen",
-        label="NN (1992), frozen",
-        look=("#7A3600", "o"),
-        build=frozen_nn,
-        prior_knowledge=EVERYTHING,
-        knows=_KNOWS_SIGN,
-        searched=f"{_NN_SEARCH}; 1,200 samples of learning before the run",
-        assumes=("scale",),
-        random=True,
-        compared=False,
     ),
     ControllerSpec(
         name="pi",
