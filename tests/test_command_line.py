@@ -56,7 +56,6 @@ REFUSED = {
     "claims": [(["everything"], "no 'everything'")],
     "compare": [
         (["--agents", "nn", "pie"], "--agents: there is no 'pie'; choose from idle, nn, "),
-        (["--agents", "nothing"], "--agents: 'nothing' is now called 'idle'"),
         (["--agent", "mine=none.json"], "needs the file .none.json., which does not exist"),
         (["--agents"], "name at least one controller"),
         (["--scenarios", "circle"], "no 'circle'"),

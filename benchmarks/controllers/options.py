@@ -15,7 +15,7 @@ from typing import Annotated
 
 from agents import PolicyNetwork
 from benchmarks.controllers.own import OwnController, make_controller
-from benchmarks.controllers.roster import OWN_LOOKS, RENAMED, ROSTER
+from benchmarks.controllers.roster import OWN_LOOKS, ROSTER
 from benchmarks.controllers.spec import EVERYTHING, LIMITS, ControllerSpec
 from benchmarks.lib.command import Names, Parameter, known, options
 from benchmarks.lib.errors import UsageError
@@ -45,28 +45,6 @@ class ControllerOptions:
     fan_out: FanOut = field(default_factory=FanOut)
 
 
-def agent_names(option: str, names: Sequence[str]) -> list[str]:
-    """Return the controller names that a user typed after an option, each once.
-
-    Parameters
-    ----------
-    option
-        Name of the command-line option for the error message, such as "--agents".
-    names
-        Names that the user typed.
-
-    Raises
-    ------
-    UsageError
-        If an element of `names` is not the name of a controller in `ROSTER`. The message for a
-        renamed controller has the new name of the controller.
-    """
-    for name in names:
-        if name in RENAMED:
-            raise UsageError(f"{option}: {name!r} is now called {RENAMED[name]!r}")
-    return known(option, names, ROSTER)
-
-
 def chosen(
     names: Sequence[str], user_controllers: Sequence[str] = ()
 ) -> dict[str, ControllerSpec]:
@@ -91,7 +69,7 @@ def chosen(
     """
     if not (names or user_controllers):
         raise UsageError("--agents, --agent: name at least one controller")
-    specs = {name: ROSTER[name] for name in agent_names("--agents", names)}
+    specs = {name: ROSTER[name] for name in known("--agents", names, ROSTER)}
     locations_of: dict[str, list[str]] = {}
     for word in user_controllers:
         name, location = _name_and_location(word)

@@ -230,11 +230,6 @@ _SPECS = (
 ROSTER = {spec.name: spec for spec in _SPECS}
 """All controllers by name."""
 
-RENAMED = {
-    "nothing": "idle",
-}
-"""The present names of controllers by their names in earlier versions."""
-
 
 def label(agent: str) -> str:
     """Return the name of a controller in tables and pictures, such as "MPC" for "mpc".
