@@ -72,7 +72,6 @@ REFUSED = {
         (["--agent", "mine"], "NEW_NAME=MODULE:FACTORY"),
         (["--agent", "mine=my_controllers.py:PI"], r"\(MODULE without \.py\)"),
         (["--agent", "mine=my_controllers:PI"], "needs the module .my_controllers., which is"),
-        (["--agent", "mine=PPO:none.zip"], "needs the file .none.zip., which does not exist"),
         (["--out", ""], "--out: . must not be the current folder"),
         (["--out", "/proc/here"], "cannot be written to: "),
     ],

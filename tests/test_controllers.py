@@ -4,12 +4,8 @@ import copy
 import pickle
 import re
 
-import gymnasium
 import numpy as np
 import pytest
-import torch
-from gymnasium.wrappers import DelayObservation
-from stable_baselines3 import PPO
 
 from benchmarks.compare.comparison import run_case
 from benchmarks.controllers.options import chosen
@@ -19,7 +15,6 @@ from benchmarks.loop.rollout import make_plants, mean_error
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
-from mptc_gym.sb3 import load, make_vec_env, save, spec_of
 from tests.verify_bounds import errors
 
 ACTUATOR = {"u_min": -9.0, "u_max": 14.0, "dead_zone": 4.0}
@@ -167,10 +162,6 @@ class TestOwnControllers:
                 "class Mine: __init__ = lambda self, gain: None",
                 r"mine=.* cannot be made: .*argument: 'gain': a factory gets only \w+",
             ),
-            (
-                "from mptc_gym import MiddlePointEnv as E\ndef Mine(): return (lambda o: o), E",
-                "must have the case's plant and set point",
-            ),
         ],
     )
     def test_bad_ones(self, code, complaint, written):
@@ -188,84 +179,10 @@ class TestOwnControllers:
         assert errors(members[0], 1, 60, setpoint_window=7) == errors(members[0], 1, 60)
 
 
-@pytest.fixture(scope="module")
-def zips(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("models")
-    velocity = {"max_move": 0.3, "compensate_dead_zone": True}
-    windows = {"action_window": 20, "error_window": 2}
-    plants = make_vec_env("MiddlePoint-v0", 2, wrapper=velocity, **windows)
-    model = PPO("MlpPolicy", plants, n_steps=8, batch_size=16, seed=0, device="cpu")
-    save(model, folder / "velocity.zip")
-    bare = PPO("MlpPolicy", gymnasium.make("MiddlePoint-v0"), device="cpu")
-    bare.save(folder / "bare.zip")
-    model.save(folder / "wide.zip")  # of other windows, which it does not say
-    delayed = DelayObservation(gymnasium.make("MiddlePoint-v0"), 2)
-    save(PPO("MlpPolicy", delayed, device="cpu"), folder / "delayed.zip")
-    with torch.no_grad():
-        for weight in model.policy.parameters():
-            weight.fill_(torch.nan)
-    save(model, folder / "nan.zip")
-    return folder
-
-
-class TestSavedPolicies:
-    """Zips of Stable-Baselines3: they act as their file says, or in the plain environment."""
-
-    @pytest.mark.parametrize(
-        ("name", "preset"),
-        [("velocity", "hard"), ("delayed", "noisy"), ("bare", "noisy")],
-    )
-    def test_it_does_what_it_was_trained_to(self, name, preset, zips):
-        file = zips / f"{name}.zip"
-        (member,) = members_of(f"PPO:{file}")
-        assert "weights: 0 M samples a policy" in member.provenance["searched"]
-        assert ("note" in member.provenance) == (name == "bare")  # which is told to the user
-        controller = member.make(PRESETS[preset], 3, SEED)
-        found = errors(member, 3, 100, **PRESETS[preset])
-        model = PPO.load(file, device="cpu")
-        env = copy.deepcopy(gymnasium.spec(IDS[preset]))
-        if name != "bare":  # the others say where they act
-            model = load(file, device="cpu")
-            env = spec_of(model, env)
-        env.max_episode_steps = 100
-        expected = evaluate(model, env, episodes=3)
-        np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-12)
-        # What it remembers, the flow, is forgotten at the beginning of an episode.
-        first, again = (
-            member.run(PRESETS[preset], 30, 3, SEED, controller).applied for _ in range(2)
-        )
-        np.testing.assert_array_equal(first, again)
-
-    def test_a_function_gives_the_policy_and_where_it_acts(self, written):
-        code = (
-            "import dataclasses\n"
-            "from gymnasium.wrappers import DelayObservation\n"
-            "from mptc_gym import MiddlePointEnv\n"
-            "def Mine(parameters):\n"
-            "    given = dataclasses.asdict(parameters)\n"
-            "    make = lambda: DelayObservation(MiddlePointEnv(**given), 2)\n"
-            "    return lambda seen: -0.1 * seen[:, 3:4], make\n"
-        )
-        (member,) = members_of(written(code))
-        found = errors(member, 3, 100, **PRESETS["noisy"])
-        expected = evaluate(
-            lambda seen: -0.1 * seen[:, 3:4],
-            lambda: DelayObservation(gymnasium.make(IDS["noisy"], max_episode_steps=100), 2),
-            episodes=3,
-        )
-        np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-9)
-
-    @pytest.mark.parametrize(
-        ("location", "complaint"),
-        [
-            ("PPO:{}/wide.zip", "observation space of policy's training"),
-            ("No:{}/bare.zip", "bare.zip' cannot be loaded"),
-            ("SAC:{}/bare.zip", "bare.zip' cannot be loaded"),
-            ("PPO:{}/nan.zip", "Expected parameter loc"),
-            ("{}/velocity.zip", "must have the form NEW_NAME="),
-            ("PPO:{}/none.zip", "none.zip., which does not exist"),
-        ],
-    )
-    def test_what_is_refused(self, location, complaint, zips):
-        with pytest.raises(ValueError, match=complaint):
-            members_of(location.format(zips))[0].run({}, 2, 2, 0)
+def test_a_function_gives_the_policy_and_what_it_observes(written):
+    code = "def Mine(): return lambda seen: -0.1 * seen[:, :1], {'setpoint_window': 0}\n"
+    (member,) = members_of(written(code))
+    found = errors(member, 3, 100, **PRESETS["noisy"])
+    plant = {"max_episode_steps": 100, "setpoint_window": 0}
+    expected = evaluate(lambda seen: -0.1 * seen[:, :1], IDS["noisy"], episodes=3, **plant)
+    np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-9)

@@ -25,8 +25,8 @@ AgentNames = Annotated[
     Names, Parameter(help=f"The controllers to run, from {', '.join(ROSTER)}.")
 ]
 FORMS = (
-    "NEW_NAME=MODULE:FACTORY (MODULE without .py), NEW_NAME=PPO:FILE.zip, NEW_NAME=gains.json "
-    "of benchmarks.tune, or NEW_NAME=FILE.npz of benchmarks.train"
+    "NEW_NAME=MODULE:FACTORY (MODULE without .py), NEW_NAME=gains.json of benchmarks.tune, or "
+    "NEW_NAME=FILE.npz of benchmarks.train"
 )
 # The name of a module, such as "mine" or "package.mine". A name that ends in ".py" is a file.
 MODULE_NAME = re.compile(r"\w+(\.(?!py$)\w+)*")
@@ -39,9 +39,8 @@ class ControllerOptions:
 
     agent: Names = ()
     """A controller of your own, which runs in addition to those of --agents. Its form is
-    NAME=MODULE:FACTORY; NAME=PPO:FILE.zip for a model of Stable-Baselines3 (loading a zip runs
-    the code in it); NAME=gains.json for a file of benchmarks.tune; or NAME=FILE.npz for a file
-    of benchmarks.train. The same name again adds another training of the controller."""
+    NAME=MODULE:FACTORY; NAME=gains.json for a file of benchmarks.tune; or NAME=FILE.npz for a
+    file of benchmarks.train. The same name again adds another training of the controller."""
     fan_out: FanOut = field(default_factory=FanOut)
 
 
@@ -94,8 +93,6 @@ def _name_and_location(word: str) -> tuple[str, str]:
     file = ""
     if location.endswith((".json", ".npz")):
         file = location
-    elif location.endswith(".zip"):
-        file = factory  # of ALGORITHM:FILE.zip
     is_module = bool(factory) and MODULE_NAME.fullmatch(module) is not None
     if not name or not (file or is_module):
         raise UsageError(f"--agent: {word!r} must have the form {FORMS}")

@@ -8,11 +8,10 @@ other tasks.
 
 import importlib
 import inspect
-import pkgutil
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -23,12 +22,7 @@ from agents.networks import WINDOWS
 from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.errors import UsageError
 from benchmarks.lib.provenance import CODE_FOLDERS, ROOT
-from benchmarks.loop.rollout import Agent, Trajectory, rollout
-from mptc_gym import IDS, Parameters
-from mptc_gym.environments.layers import plant_groups
-from mptc_gym.evaluation import case_of
-from mptc_gym.scoring.fit import check_fit
-from mptc_gym.scoring.opening import opened
+from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from mptc_gym.scoring.policies import start
 
 Factory = Callable[..., Any]
@@ -44,7 +38,7 @@ class OwnController(ControllerSpec):
     Attributes
     ----------
     locations : sequence of str
-        Locations of the user's factories, in the form MODULE:FACTORY or ALGORITHM:FILE.zip.
+        Locations of the user's factories, in the form MODULE:FACTORY.
     """
 
     locations: Sequence[str]
@@ -98,8 +92,8 @@ class OwnController(ControllerSpec):
         agent = controller or self.make(plant, runs, seed)
         with blame_user(f"{self.name}={self.locations[0]}", "run"):
             if isinstance(agent, PolicyAgent):
-                with agent.opened(samples, **{**plant, **self.observation}) as plants:
-                    return rollout(plants, agent, samples, seed)
+                plant = {**plant, **self.observation, **agent.interface}
+                return rollout(make_plants(runs, samples, **plant), agent, samples, seed)
             return super().run(plant, samples, runs, seed, agent)
 
 
@@ -132,15 +126,13 @@ def blame_user(controller: str, step: str) -> Iterator[None]:
 
 
 def load_factory(location: str) -> Factory:
-    """Return the user's factory at the location MODULE:FACTORY or ALGORITHM:FILE.zip.
+    """Return the user's factory at the location MODULE:FACTORY.
 
     Raises
     ------
     ValueError
         If the module MODULE has no attribute FACTORY, or if FACTORY is not callable.
     """
-    if location.endswith(".zip"):
-        return _factory_of_zip(location)
     module_name, _, name = location.partition(":")
     module = importlib.import_module(module_name)
     try:
@@ -150,38 +142,6 @@ def load_factory(location: str) -> Factory:
     if not callable(factory):
         raise ValueError(f"{name!r} must be a function or a class, got {factory!r}")
     return factory  # type: ignore[no-any-return]
-
-
-def _factory_of_zip(location: str) -> Factory:
-    """Return a factory that returns the Stable-Baselines3 model at ALGORITHM:FILE.zip.
-
-    A file that `mptc_gym.sb3.save` wrote describes the environment that the model acts in. If
-    another function wrote the zip file, the model acts in `MiddlePoint-v0` without wrappers.
-    """
-    import stable_baselines3  # imported here, as PyTorch takes seconds to load
-
-    from mptc_gym.sb3 import load
-
-    algorithm, _, file = location.partition(":")
-    note = ""
-    try:
-        model: Any = load(file, device="cpu")
-    except ValueError:  # The file is not one of `mptc_gym.sb3.save`.
-        kind: Any = getattr(stable_baselines3, algorithm, None)
-        kind = kind or pkgutil.resolve_name(f"sb3_contrib:{algorithm}")
-        model = kind.load(file, device="cpu")
-        note = f"{file} names no environment: run in the plain one, without wrappers."
-
-    def factory() -> Any:
-        return model
-
-    # Some of the attributes in `TEXTS`, which the report prints.
-    weights = sum(weight.numel() for weight in model.policy.parameters())
-    samples = f"{model.num_timesteps / 1e6:.3g} M samples a policy"
-    factory.searched = f"{weights:,} weights: {samples}"  # type: ignore[attr-defined]
-    if note:
-        factory.note = note  # type: ignore[attr-defined]
-    return factory
 
 
 def observation_of(factory: Factory) -> Mapping[str, int]:
@@ -232,32 +192,21 @@ def make_controller(*, factory: Factory, **prior_knowledge: Any) -> Agent:
         ) from error
     product = factory(**arguments)
     if isinstance(product, tuple):
-        policy, env = product
-        return PolicyAgent(policy, env, prior_knowledge["num_envs"])
+        policy, interface = product
+        return PolicyAgent(policy, prior_knowledge["num_envs"], interface)
     if hasattr(product, "reset") and hasattr(product, "act"):
         return product  # type: ignore[no-any-return]
-    return PolicyAgent(product, None, prior_knowledge["num_envs"])
+    return PolicyAgent(product, prior_knowledge["num_envs"])
 
 
 @dataclass
 class PolicyAgent:
-    """A controller that uses a policy in any form that `mptc_gym.evaluate` accepts.
-
-    Attributes
-    ----------
-    policy
-        The policy.
-    env
-        Environment that the policy acts in, or a function that makes the environment. If `env`
-        is None, the policy acts in the environment that was saved with a Stable-Baselines3
-        model, or in `MiddlePoint-v0` without wrappers if no environment was saved.
-    runs : int
-        Number of runs that the policy controls at once.
-    """
+    """A controller of `runs` runs that uses a policy in any form that `evaluate` accepts."""
 
     policy: Any
-    env: Any
     runs: int
+    # Arguments of the environment in which the policy acts, such as `action_window`, by name.
+    interface: Mapping[str, Any] = field(default_factory=dict)
 
     def reset(self) -> None:
         """Prepare for a new episode."""
@@ -266,38 +215,3 @@ class PolicyAgent:
     def act(self, observation: Any) -> Any:
         """Return the actions for an observation with a row for each run, shape (runs, 1)."""
         return self._act(observation)
-
-    @contextmanager
-    def opened(self, samples: int, **arguments: Any) -> Iterator[Any]:
-        """Yield a vector environment of `runs` plants with the wrappers that the policy needs.
-
-        An episode has `samples` samples. `arguments` are arguments of `MiddlePoint-v0`, which
-        define the plant and the set point. A ValueError is raised if the policy's own
-        environment has a different plant or set point, or if the policy does not fit the
-        observations.
-        """
-        case = case_of(Parameters(**arguments))
-        with self._open({**arguments, "max_episode_steps": samples}) as plants:
-            if any(case_of(group.parameters) != case for group in plant_groups(plants)):
-                raise ValueError(
-                    "the policy's environment must have the case's plant and set point"
-                )
-            check_fit(self.policy, plants)
-            yield plants
-
-    def _open(self, arguments: Mapping[str, Any]) -> AbstractContextManager[Any]:
-        """Return a context manager of a vector environment with `runs` plants.
-
-        `arguments` are keyword arguments of `gymnasium.make`. If `env` is not None, `arguments`
-        are not used.
-        """
-        if self.env is not None:
-            return opened(self.env, self.runs, self.policy)
-        if not hasattr(self.policy, "get_env") or self.policy.get_env() is None:
-            return opened(IDS["paper"], self.runs, self.policy, **arguments)
-        from mptc_gym.sb3 import spec_of
-
-        # The windows and the wrappers are those in which the saved model was trained.
-        without_windows = {name: arguments[name] for name in arguments if name not in WINDOWS}
-        spec = spec_of(self.policy, **without_windows)
-        return opened(spec, self.runs, self.policy)
