@@ -21,7 +21,7 @@ from benchmarks.loop.rollout import Trajectory
 from mptc_gym import MiddlePointVectorEnv
 from mptc_gym.evaluation import WINDOWS
 from mptc_gym.plant import checks
-from mptc_gym.plant.parameters import ARGUMENTS, PLANT_NUMBERS
+from mptc_gym.plant.parameters import ARGUMENTS, CAN_BE_RANGES
 
 ROOT = Path(__file__).parent.parent
 if not os.access(ROOT, os.W_OK):
@@ -62,7 +62,7 @@ STRATEGIES = BY_NAME | {
     for name, argument in ARGUMENTS.items()
     if name not in BY_NAME
 }
-for name in PLANT_NUMBERS:
+for name in sorted(CAN_BE_RANGES):
     STRATEGIES[name] |= st.lists(STRATEGIES[name], min_size=2, max_size=2).map(sorted)
 
 

@@ -384,9 +384,9 @@ class TestCompare:
         assert all(f"({picture.name})" in page for picture in out.glob("*.png"))
 
     @pytest.mark.usefixtures("undrawn")
-    def test_where_limits_are_drawn_shares_are_not_measured(self, monkeypatch, tmp_path):
+    def test_where_the_dead_zone_is_drawn_shares_are_not_measured(self, monkeypatch, tmp_path):
         monkeypatch.chdir(tmp_path)
-        given = "--set u_max=[8,12] --scenarios constant --agents pi --runs 2 --jobs 1"
+        given = "--set dead_zone=[3,7] --scenarios constant --agents pi --runs 2 --jobs 1"
         assert main(given.split()) == 0
         folder = tmp_path / "results/compare-plant"
         assert pd.read_csv(folder / "runs.csv")["saturation_share"].isna().all()

@@ -14,7 +14,7 @@ from mptc_gym.wrappers import IncrementalAction
 from mptc_gym.wrappers import vector as many
 
 RANGES = {
-    "dead_zone": [2.0, 8.0], "u_min": [-14.0, -9.0], "u_max": [8.0, 12.0], "delay": [3, 9],
+    "dead_zone": [2.0, 8.0], "delay": [3, 9],
     "noise_variance": 0.3, "setpoint": "random", "setpoint_period": 40, "action_window": 4,
     "move_weight": 0.1,
 }  # fmt: skip
@@ -65,8 +65,7 @@ def test_drawn_numbers_are_those_of_the_episode():
         _, info = env.reset(seed=None if drawn else 3)
         drawn.add(info["dead_zone"])
         applied = [env.step(np.array([move]))[4]["applied"] for move in (1e-9, 1.0, -1.0)]
-        drawn_numbers = [info[name] for name in ("dead_zone", "u_max", "u_min")]
-        assert applied == pytest.approx(drawn_numbers, abs=1e-4)
+        assert applied == pytest.approx([info["dead_zone"], 10.0, -10.0], abs=1e-4)
     assert len(drawn) == 5
 
 

@@ -109,8 +109,8 @@ class TestResponses:
                 ],
             ),
             (
-                0.0, {"setpoint": "random", "u_max": [8, 10]},
-                ["set point", "first run", "dead zone", "widest flow limits"],
+                0.0, {"setpoint": "random"},
+                ["set point", "first run", "dead zone", "flow limits"],
             ),
         ],
     )  # fmt: skip

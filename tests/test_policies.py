@@ -448,8 +448,6 @@ CASES = {
         lambda: wrappers.TimeLimit(MiddlePointEnv(noise_variance=0.5, dead_zone=0.0), LENGTH)),
     "one environment": lambda _: of_integrator(one()),
     "one environment in mid-episode": lambda _: of_integrator(in_mid_episode(one())),
-    "random limits": lambda _: of_integrator(
-        make := partial(one, u_min=[-12.0, -8.0], u_max=[8.0, 12.0]), make),
     "wrapper that returns tensors": lambda _: of_function(
         law, wrappers.TransformObservation(one(), torch.as_tensor, None)),
     "batch": lambda _: of_integrator(many()),

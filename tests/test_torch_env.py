@@ -128,14 +128,14 @@ def test_it_equals_it_over_long_episodes_in_both_types(dtype, rtol, atol, rng):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_command_on_the_edge_of_the_dead_zone_passes(rng, dtype):
     # Of plants with limits of their own.
-    n, ranges = 600, {"u_min": [-12, -5], "u_max": [5, 12], "dead_zone": [0.1, 5]}
+    n, ranges = 600, {"dead_zone": [0.1, 5]}
     envs, env = MiddlePointVectorEnv(n, **ranges), make(n, dtype=dtype, **ranges)
     _, infos = envs.reset(seed=int(rng.integers(2**30)))
     drawn = {name: infos[name] for name in ranges}
     env.reset(options={"signals": {k: torch.tensor(each) for k, each in drawn.items()}})
     commands = rng.choice([-1, 1], n) * drawn["dead_zone"]
-    exact = action_from_command(commands, drawn["u_min"], drawn["u_max"])
-    for actions in (exact[:, None], float32_action(commands, **drawn)[:, None]):
+    exact = action_from_command(commands, -10.0, 10.0)
+    for actions in (exact[:, None], float32_action(commands, -10.0, 10.0, **drawn)[:, None]):
         for applied in (env.step(torch.tensor(actions)), envs.step(actions)):
             np.testing.assert_allclose(applied[-1]["applied"], commands, rtol=0, atol=1e-5)
 
@@ -144,7 +144,7 @@ class TestGradients:
     @pytest.mark.parametrize("plant", [
         {"dead_zone": 0.0, "action_window": 2}, {"delay": [2, 4], "gain_factor": [0.5, 2]},
         {**PRESETS["hard"], "delay": 2, "dead_zone": 1.0, "action_window": 3,
-         "output_window": 2, "move_weight": 0.1, "u_min": [-12.0, -10.0]},
+         "output_window": 2, "move_weight": 0.1, "u_min": -12.0},
     ])  # fmt: skip
     def test_it_is_that_of_differences_away_from_the_kinks(self, plant):
         env = make(2, **{"delay": 2, "output_window": 1, "differentiable": True, **plant})
@@ -243,7 +243,7 @@ class Waiting(TorchDispatchMode):
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_step_never_waits_for_the_device(mode, differentiable):
     shell = {"max_episode_steps": 12, "autoreset_mode": mode, "differentiable": differentiable}
-    most = {**PRESETS["hard"], "action_window": 5, "move_weight": 0.1, "u_max": [9.0, 10.0]}
+    most = {**PRESETS["hard"], "action_window": 5, "move_weight": 0.1}
     for plant in (most, {}):
         env = make(3, **shell, **plant)
         env.checks_actions = False  # as on any device but the CPU

@@ -201,8 +201,7 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     - `dead_zone_share`: share of samples with the command inside the dead zone, %;
     - `saturation_share`: share of samples with the command at or beyond a limit, %.
 
-    `dead_zone_share` and `saturation_share` are NaN if the dead zone or a limit of the flow is
-    drawn from a range.
+    `dead_zone_share` and `saturation_share` are NaN if the dead zone is drawn from a range.
     """
     interval = parameters.sampling_interval / 60.0  # min
     errors = np.abs(trajectory.next_error)
@@ -250,10 +249,10 @@ def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]
 
     The returned dict has arrays of shape (runs,) by the names of the measures in `measure`.
 
-    The percentages are NaN if the dead zone or a limit of the flow in `parameters` is a range.
+    The percentages are NaN if the dead zone in `parameters` is a range.
     `command` has the commanded flows, t/h, shape (samples, runs).
     """
-    if {"dead_zone", "u_min", "u_max"} & set(parameters.ranges):
+    if "dead_zone" in parameters.ranges:
         unknown = np.full(command.shape[1], np.nan)
         return {"dead_zone_share": unknown, "saturation_share": unknown}
     u_min, u_max = parameters.u_min, parameters.u_max

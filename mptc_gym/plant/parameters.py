@@ -35,7 +35,8 @@ class PlantNumbers(Generic[Value]):
     """The arguments of a plant that can differ from episode to episode, such as the delay.
 
     In the arguments of the environment, each field of `PlantNumbers` is one number, or a range
-    [low, high] from which each reset of the environment samples one number. During an episode,
+    [low, high] from which each reset of the environment samples one number; only `u_min` and
+    `u_max` are always one number. During an episode,
     each field of `PlantNumbers` is a float for one plant, or an array or tensor for many
     plants.
 
@@ -224,7 +225,7 @@ class Parameters(PlantNumbers[Number]):
     def __post_init__(self) -> None:
         for name, argument in ARGUMENTS.items():
             check = argument.metadata["check"]
-            if name in PLANT_NUMBERS:
+            if name in CAN_BE_RANGES:
                 check = partial(checks.number_or_range, check)
             value = check(name, checks.to_python(getattr(self, name)))
             object.__setattr__(self, name, value)  # the dataclass is frozen
@@ -265,20 +266,15 @@ class Parameters(PlantNumbers[Number]):
         return cls(**arguments)
 
     def _check_actuator(self) -> None:
-        """Raise a ValueError if a reset could sample limits or a dead zone that do not fit.
+        """Raise a ValueError if the limits of the flow or the dead zone do not fit together.
 
-        For all values that a reset may sample from ranges, `u_min` must be below `u_max`, and
-        `dead_zone` must not exceed max(|u_min|, |u_max|), so that some flow command from
-        `u_min` to `u_max` can pass the dead zone.
+        `u_min` must be below `u_max`, and `dead_zone` must not exceed max(|u_min|, |u_max|), so
+        that some flow command from `u_min` to `u_max` can pass the dead zone.
         """
-        lowest_u_min, highest_u_min = self.range_of("u_min")
-        lowest_u_max, highest_u_max = self.range_of("u_max")
-        if highest_u_min >= lowest_u_max:
-            reject("u_min", self.u_min, f"below u_max = {self.u_max}")
-        # The largest magnitude of a flow from u_min to u_max is max(|u_min|, |u_max|), of which
-        # a reset can sample the following smallest value. In a range [low, high], the smallest
-        # magnitude is max(low, -high, 0).
-        largest_command = max(lowest_u_min, -highest_u_min, lowest_u_max, -highest_u_max, 0.0)
+        u_min, u_max = self.lowest.u_min, self.lowest.u_max
+        if u_min >= u_max:
+            reject("u_min", u_min, f"below u_max = {u_max}")
+        largest_command = max(abs(u_min), abs(u_max))
         _, largest_dead_zone = self.range_of("dead_zone")
         if largest_dead_zone > largest_command:
             allowed = "small enough for some command to pass, at most max(|u_min|, |u_max|)"
@@ -363,6 +359,9 @@ ARGUMENTS: Final[dict[str, Any]] = {argument.name: argument for argument in fiel
 PLANT_NUMBERS: Final = {number.name: i for i, number in enumerate(fields(PlantNumbers))}
 """Index of each field of `PlantNumbers`, and of the field's random number, by name."""
 
+CAN_BE_RANGES: Final = PLANT_NUMBERS.keys() - {"u_min", "u_max"}
+"""The names of the arguments that can be a range [low, high]."""
+
 
 def argument_table() -> str:
     """Return a Markdown table with a row for each argument except `render_mode`.
@@ -373,7 +372,7 @@ def argument_table() -> str:
     rows = ["| Argument | Default | Unit | Meaning |", "|---|---|---|---|"]
     for name, argument in ARGUMENTS.items():
         default = repr(argument.default).replace("'", '"')
-        if name in PLANT_NUMBERS:
+        if name in CAN_BE_RANGES:
             default += "*"
         unit = argument.metadata["unit"]
         meaning = argument.metadata["meaning"]
@@ -403,6 +402,8 @@ def full_signature(constructor: Callable[..., Any]) -> inspect.Signature:
     for parameter in inspect.signature(Parameters).parameters.values():
         annotation = parameter.annotation
         if parameter.name in PLANT_NUMBERS:
+            annotation = "float"
+        if parameter.name in CAN_BE_RANGES:
             annotation = "float | Sequence[float]"
         parameters.append(parameter.replace(annotation=annotation))
     return inspect.Signature(parameters)

@@ -134,11 +134,6 @@ class Episodes:
         self.generator.seed()  # from the operating system, until `reset` gets a seed
         self._ranges = parameters.ranges
         tensor_names = set(self._ranges)
-        # If one limit of the actuator is random, both limits are tensors: PyTorch clamps either
-        # between two numbers or between two tensors.
-        limits = {"u_min", "u_max"}
-        if limits & tensor_names:
-            tensor_names |= limits
         self.numbers: dict[str, Number] = {}
         for name, lowest in vars(parameters.lowest).items():
             self.numbers[name] = zeros + lowest if name in tensor_names else float(lowest)
