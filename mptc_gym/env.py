@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mptc_gym.environments.record import Record
 from mptc_gym.plant.checks import NOT_A_NUMBER, one_action, one_of, to_python
-from mptc_gym.plant.dynamics import Plant, action_from_command
+from mptc_gym.plant.dynamics import Plant, WantedFlows, action_from_command
 from mptc_gym.plant.parameters import Parameters, full_signature, insert_table
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import ONLY_PLANT, Signals
@@ -141,6 +141,15 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     An action below -1 or above 1 commands a flow outside the range from `u_min` to `u_max`; the
     actuator limits the applied flow to this range.
 
+    With the argument `action="change"`, the velocity form of process control, the action w is
+    a change of a wanted flow v that starts at 0 t/h, and is clipped to +-1:
+    v(k) = v(k-1) + w(k) * max_move * (u_max - u_min) / 2, limited to [u_min, u_max]. The
+    commanded flow is u(k) = v(k). With a `compensated_dead_zone` z above 0 t/h, the commanded
+    flow skips a dead zone of the half width z: u = z + (u_max - z) v / u_max for v > 0, u = 0
+    for v = 0, and u = -z + (u_min + z) v / u_min for v < 0. In observation and reward, the
+    action a(k) then is the one that commands the flow u(k). A policy must know the wanted flow,
+    so the observation needs an `action_window` of at least 1.
+
     ## Observation space
 
     The observation is a 1-D float32 array that joins four blocks: set points, errors, outputs
@@ -263,6 +272,9 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         self._layout = tuple(np.cumsum(parameters.windows).tolist())
         self._has_more_info = parameters.is_disturbed or parameters.drifts
         self._plant_sampler = PlantSampler(parameters)
+        self._wanted_flows: WantedFlows | None = None
+        if parameters.action == "change":
+            self._wanted_flows = WantedFlows(parameters, 1)
         self._signals = Signals.of(parameters)
         # Random number streams of the environment's plant; empty before the first reset.
         self._streams: list[RandomStreams] = []
@@ -308,6 +320,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         numbers = plant_numbers(arrays_of_numbers, 0)
         self._plant = Plant(self.parameters, numbers)
         self._coming_signals.clear()
+        if self._wanted_flows is not None:
+            self._wanted_flows.reset(ONLY_PLANT)
 
         # At rest, the commanded flow is 0 t/h. The action for 0 t/h depends on the limits.
         self._action = action_from_command(0.0, numbers.u_min, numbers.u_max)
@@ -339,7 +353,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         Parameters
         ----------
         action
-            The action a(k), shape (1,): -1 commands the flow `u_min`, and 1 commands `u_max`.
+            The action, shape (1,): a(k), of which -1 commands the flow `u_min` and 1 the flow
+            `u_max`, or the change w(k) if the argument `action` is "change".
 
         Returns
         -------
@@ -364,17 +379,16 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
             a = float(action.item() - 0.0)  # subtracting 0.0 fails for text such as "0.3"
         except NOT_A_NUMBER:
             a = one_action(action)
-        observed_action = a
-        if not -1.0 <= a <= 1.0:
-            observed_action = _clip(a, 1.0)
-            if not math.isfinite(a):
-                one_action(a)  # raises a ValueError, as the action is not finite
+        if not math.isfinite(a):
+            one_action(a)  # raises a ValueError, as the action is not finite
         if not self._coming_signals:
             if not self._streams:  # random number streams, which the first reset makes
                 raise ResetNeeded("call reset before step")
             # In reverse order, because `pop` returns the last element of the list.
             self._coming_signals = self._signals.ahead()[::-1]
         setpoint, noise, load, measurement_noise = self._coming_signals.pop()
+        if self._wanted_flows is not None:
+            a = self._wanted_flows.change(np.array([a])).item()
 
         command, applied, output = self._plant.step(a, noise, load)
         error = setpoint - output
@@ -400,7 +414,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         window.pop()
         window[error_index] = setpoint - reading
         window[output_index] = reading
-        window[action_index] = observed_action
+        window[action_index] = a if -1.0 <= a <= 1.0 else _clip(a, 1.0)
         observation = np.fromiter(window, _FLOAT32, size)  # faster than np.array
         info = {
             "output": output,

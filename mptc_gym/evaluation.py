@@ -38,7 +38,14 @@ SAMPLES: Final = 1200  # samples of an episode, unless the environment ends the 
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 # Arguments of an environment that change observations or rewards, but not the least error that
 # a controller can have.
-_WITHOUT_EFFECT_ON_BOUNDS: Final = *WINDOWS, "reward", "error_scale", "move_weight"
+_ACTION_FORM: Final = "action", "max_move", "compensated_dead_zone"
+_WITHOUT_EFFECT_ON_BOUNDS: Final = (
+    *WINDOWS,
+    *_ACTION_FORM,
+    "reward",
+    "error_scale",
+    "move_weight",
+)
 _RESAMPLES: Final = 2000  # number of bootstrap samples for the interval of a score
 
 

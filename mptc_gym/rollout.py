@@ -108,15 +108,14 @@ def replayed(
     the second simulation: the environment of the rollout then has changed the seed, skipped
     samples, or changed the plant or the infos.
     """
-    plants = MiddlePointVectorEnv(len(seeds), **asdict(parameters))
+    plants = MiddlePointVectorEnv(len(seeds), **(asdict(parameters) | {"action": "flow"}))
     _, expected = plants.reset(seed=seeds)
-    # If the actuator's limits are drawn for each episode, the infos of the reset hold them.
-    u_min = expected.get("u_min", parameters.u_min)
-    u_max = expected.get("u_max", parameters.u_max)
     for k, sample in enumerate(samples):
         if k > 0:
             commands = np.asarray(sample.infos.get("command", np.zeros(len(seeds))))
-            actions = action_from_command(commands, u_min, u_max)[:, np.newaxis]
+            actions = action_from_command(commands, parameters.u_min, parameters.u_max)[
+                :, np.newaxis
+            ]
             expected = plants.step(actions)[-1]
         if k > 0 or sample.infos:  # some environments return no infos at a reset
             _compare_infos(sample.infos, expected, k)

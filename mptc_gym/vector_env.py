@@ -17,7 +17,7 @@ from mptc_gym.env import NO_RENDER_MODE, Frame, MiddlePointEnv
 from mptc_gym.environments.batch import BatchEnv, Infos, Mask
 from mptc_gym.environments.record import Record
 from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_python
-from mptc_gym.plant.dynamics import PlantBatch, action_from_command
+from mptc_gym.plant.dynamics import PlantBatch, WantedFlows, action_from_command
 from mptc_gym.plant.parameters import full_signature
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
@@ -111,6 +111,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         block = math.ceil(self._episode_length / blocks_per_episode)
         self._signals = Signals.of(parameters, num_envs, block)
         self._plants = PlantBatch(parameters, num_envs)
+        self._wanted_flows: WantedFlows | None = None
+        if parameters.action == "change":
+            self._wanted_flows = WantedFlows(parameters, num_envs)
         self._window = _Window(parameters.windows, num_envs)
         self._actions = np.zeros(num_envs)  # the actions of the last step
         # In comparisons, an array of shape (num_envs,) is faster than a Python number. In other
@@ -157,6 +160,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         """
         # The speed of the environment depends on `_advance`. With few plants, the number of
         # NumPy calls in `_advance` determines the speed.
+        if self._wanted_flows is not None:
+            a = self._wanted_flows.change(a)
         signals = self._signals
         setpoint = signals.setpoint.next()
         noise = self._zeros
@@ -243,6 +248,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         which = np.flatnonzero(mask)  # the indices of the plants
         numbers = self._plant_sampler.sample([self._streams[i] for i in which.tolist()])
         self._plants.reset(which, numbers)
+        if self._wanted_flows is not None:
+            self._wanted_flows.reset(which)
         setpoint = self._signals.reset(which, self._streams, numbers)
         rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         self._actions[which] = rest_action

@@ -46,6 +46,8 @@ BY_CHECK = {
     checks.polynomial: polynomials,
     checks.numbers: st.lists(small_numbers, min_size=1, max_size=5),
     checks.reward: st.sampled_from(checks.REWARDS),
+    checks.action: st.sampled_from(checks.ACTIONS),
+    checks.share_of_range: st.floats(0.01, 2),
     checks.setpoint: st.sampled_from(checks.SETPOINTS)
     | setpoints
     | st.lists(setpoints, min_size=1, max_size=5),

@@ -144,6 +144,8 @@ BAD = {
     "setpoint_window": [-1], "error_window": [1.0, 10_001], "output_window": ["2"],
     "action_window": [-3, 10**9], "temperature_span": [0.0, INF],
     "reward": ["cubic", 2], "error_scale": [0.0, -5.0, 1e-100], "move_weight": [-1.0, NAN],
+    "action": ["position", None], "max_move": [0.0, 2.1, NAN, "x", True],
+    "compensated_dead_zone": [-1.0, INF, True, None, [3.0, 5.0]],
     "render_mode": ["depth_array", "", 3],
 }  # fmt: skip
 

@@ -23,6 +23,7 @@ MOST_COEFFICIENTS: Final = 1_000  # of one polynomial of the plant
 MOST_PLANTS: Final = 10_000_000  # in one environment, or in one evaluation
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
+ACTIONS: Final = ("flow", "change")
 _COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # NumPy takes a dtype faster than the type np.float64
 _LONGEST_REPR = 80  # characters of a value in an error message, to keep the message readable
@@ -146,16 +147,19 @@ def is_count(value: Any, minimum: int = 0) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
 
 
-def number(name: str, value: Any, low: float = -LARGEST_NUMBER) -> float:
-    """Return an argument's value as a float; ValueError unless a number from `low` to 1e9."""
-    if not is_number(value) or value < low:
-        reject(name, value, f"a number from {low:g} to {LARGEST_NUMBER:g}")
+def number(
+    name: str, value: Any, low: float = -LARGEST_NUMBER, high: float = LARGEST_NUMBER
+) -> float:
+    """Return a number as a float; ValueError unless it is from `low` to `high`."""
+    if not is_number(value) or not low <= value <= high:
+        reject(name, value, f"a number from {low:g} to {high:g}")
     return float(value) + 0.0  # which turns -0.0 into 0.0
 
 
 not_negative = partial(number, low=0.0)
 positive = partial(number, low=1e-9)  # not 0.0, as `number` allows the value `low` itself
 at_least_1 = partial(number, low=1.0)
+share_of_range = partial(number, low=1e-9, high=2.0)  # in halves of the range
 
 
 def count(name: str, value: Any, minimum: int, maximum: int) -> int:
@@ -209,6 +213,7 @@ def one_of(name: str, value: Any, choices: Sequence[str | None]) -> Any:
 
 
 reward = partial(one_of, choices=REWARDS)
+action = partial(one_of, choices=ACTIONS)
 
 
 def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:

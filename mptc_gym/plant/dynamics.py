@@ -99,6 +99,64 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     return np.where(had_effect & ~has_effect, moved_actions, actions)
 
 
+class WantedFlows:
+    """The wanted flows of n plants, which actions change: the action form "change".
+
+    In process control, a change of the flow at each sample is called the velocity form. An
+    action w(k) changes the wanted flow v, t/h, which is 0 before k = 0::
+
+        v(k) = v(k-1) + w(k) max_move (u_max - u_min) / 2,   limited to [u_min, u_max]
+
+    The commanded flow u skips the dead zone with the half width z = `compensated_dead_zone`::
+
+        v > 0:   u =  z + (u_max - z) v / u_max
+        v = 0:   u =  0
+        v < 0:   u = -z + (u_min + z) v / u_min
+
+    If a limit lies inside the dead zone, all commands towards this limit are on the edge of the
+    dead zone, and the actuator applies the limit.
+
+    Parameters
+    ----------
+    parameters
+        Arguments of the environment.
+    n
+        Number of plants.
+    """
+
+    def __init__(self, parameters: Parameters, n: int) -> None:
+        self._u_min = parameters.lowest.u_min
+        self._u_max = parameters.lowest.u_max
+        self._flow_per_action = parameters.max_move * ((self._u_max - self._u_min) / 2.0)
+        self._dead_zone = parameters.compensated_dead_zone
+        self._slope_above = self._slope(self._u_max)
+        self._slope_below = self._slope(-self._u_min)
+        self._flows = np.zeros(n)  # v, t/h
+
+    def _slope(self, limit: float) -> float:
+        """Return du/dv for flows towards a limit whose magnitude is `limit`, t/h."""
+        if limit <= 0.0:  # no wanted flow has this direction
+            return 0.0
+        return max(limit - self._dead_zone, 0.0) / limit
+
+    def reset(self, plants: NDArray[np.intp]) -> None:
+        """Set the wanted flows of the plants with the indices `plants` to 0 t/h."""
+        self._flows[plants] = 0.0
+
+    def change(self, actions: Values) -> Values:
+        """Change the wanted flows, and return the actions that set them, shape (n,).
+
+        `actions` are finite and are clipped to +-1. The returned actions are rounded to
+        float32, as the actions of a policy are.
+        """
+        flows = self._flows + self._flow_per_action * np.clip(actions, -1.0, 1.0)
+        self._flows = np.clip(flows, self._u_min, self._u_max)
+        above = (self._flows > 0.0) * (self._dead_zone + self._slope_above * self._flows)
+        below = (self._flows < 0.0) * (self._dead_zone - self._slope_below * self._flows)
+        rounded = float32_action(above - below, self._u_min, self._u_max, self._dead_zone)
+        return rounded.astype(np.float64)
+
+
 class Dynamics:
     """The coefficients of the plant for a given steady-state gain and time constant.
 

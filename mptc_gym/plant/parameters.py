@@ -219,7 +219,25 @@ class Parameters(PlantNumbers[Number]):
         0.0,
         checks.not_negative,
         "1",
-        "cost of a change of the action by 1, subtracted from the reward",
+        "cost of a change of the flow by half its range, subtracted from the reward",
+    )
+    action: str = _argument(
+        "flow",
+        checks.action,
+        "",
+        'what an action sets: "flow", or "change", a change of the flow',
+    )
+    max_move: float = _argument(
+        0.4,
+        checks.share_of_range,
+        "1",
+        '"change": change of the flow for an action of 1, as a share of half the range',
+    )
+    compensated_dead_zone: float = _argument(
+        0.0,
+        checks.not_negative,
+        "t/h",
+        '"change": half width of the dead zone that the commands skip',
     )
 
     def __post_init__(self) -> None:

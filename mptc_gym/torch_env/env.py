@@ -163,6 +163,8 @@ class MiddlePointTorchEnv(BatchEnv):
         """Prepare the plants; the docstring of the class describes the arguments."""
         one_of("render_mode", arguments.pop("render_mode", None), [None])
         super().__init__(num_envs, max_episode_steps, autoreset_mode, arguments)
+        if self.parameters.action != "flow":
+            reject("action", self.parameters.action, "'flow' in this environment")
         if not isinstance(dtype, torch.dtype) or dtype not in (torch.float32, torch.float64):
             reject("dtype", dtype, "torch.float32 or torch.float64")
         if not isinstance(differentiable, bool):
