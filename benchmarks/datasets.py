@@ -1,20 +1,14 @@
 """Record offline data sets of controlled plants: `python -m benchmarks.datasets`."""
 
-import os
-import shutil
-import tempfile
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.lib.command import Count, Names, Parameter, command, options
-from benchmarks.lib.errors import UnfinishedError
+from benchmarks.lib.command import CommandError, Count, Names, Parameter, command, options
 from benchmarks.lib.seeds import SEEDS
-from benchmarks.lib.storage import out_folder
 from mptc_gym import PRESETS, evaluate
 from mptc_gym.rollout import rollout
 
@@ -41,8 +35,6 @@ IDS = {
     for preset in ("paper", "disturbed", "fouling")
     for behaviour in BEHAVIOURS
 }
-FOLDER_VARIABLE = "MINARI_DATASETS_PATH"  # the environment variable that names Minari's folder
-DEFAULT_FOLDER = "~/.minari/datasets"  # Minari's folder if the environment variable is not set
 
 
 @dataclass(frozen=True)
@@ -67,13 +59,10 @@ class Options:
     """Episodes per data set, of 1,200 transitions each."""
 
 
-def work(options: Options) -> str:
-    """Write data sets, print each data set's mean errors, and return the final message."""
-    folder = Path(os.environ.get(FOLDER_VARIABLE) or DEFAULT_FOLDER)
-    root = out_folder(folder.expanduser().absolute(), FOLDER_VARIABLE)
+def work(options: Options) -> None:
+    """Write data sets, and print the mean errors of each data set."""
     for dataset_id in dict.fromkeys(options.ids or IDS):  # without repeated ids
-        print(f"{dataset_id}: {write(root, dataset_id, options.episodes)}", flush=True)
-    return f"The data sets are in {root}"
+        print(f"{dataset_id}: {write(dataset_id, options.episodes)}", flush=True)
 
 
 def arguments_of(preset: str) -> dict[str, Any]:
@@ -132,50 +121,26 @@ def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> l
     ]
 
 
-def write(root: Path, dataset_id: str, episodes: int) -> str:
-    """Record a data set in Minari's folder `root`, and return the mean errors as text.
+def write(dataset_id: str, episodes: int) -> str:
+    """Record a data set, write it to Minari's folder, and return mean errors as text.
 
-    A data set with the same id in the folder `root` is replaced. If the files cannot be
-    written, an `UnfinishedError` is raised, and no incomplete data set remains.
+    A CommandError is raised if Minari's folder has a data set with the same id.
     """
-    destination = root / dataset_id
-    logged = record(*IDS[dataset_id], episodes)
-    try:
-        # Minari does not list the contents of hidden folders.
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=root) as folder:
-            # HDF5 crashes if the disk is full. To raise an OSError instead, a file larger than
-            # the data set is written first and then removed.
-            room = Path(folder, "room")
-            room.write_bytes(bytes(1_000_000 + episodes * 250_000))
-            room.unlink()
-            os.environ[FOLDER_VARIABLE] = folder  # Minari has no argument for the folder
-            mean_errors = _create(dataset_id, logged)
-            shutil.rmtree(destination, ignore_errors=True)
-            destination.parent.mkdir(parents=True, exist_ok=True)
-            Path(folder, dataset_id).replace(destination)
-    except OSError as error:
-        raise UnfinishedError(
-            f"the data set {destination} could not be written: {error}"
-        ) from error
-    finally:
-        os.environ[FOLDER_VARIABLE] = str(root)
-    return mean_errors
-
-
-def _create(dataset_id: str, episodes: list[Episode]) -> str:
-    """Write recorded episodes as a data set of Minari, and return mean errors as text."""
     import minari
     from minari.data_collector import EpisodeBuffer
 
+    if dataset_id in minari.list_local_datasets():
+        raise CommandError(f"{dataset_id} exists; remove it with: minari delete {dataset_id}")
     preset, behaviour = IDS[dataset_id]
     arguments = arguments_of(preset)
+    recorded = record(preset, behaviour, episodes)
     idle = evaluate(
         lambda observations: np.zeros((len(observations), 1)),
         episodes=EVALUATION_EPISODES,
         **arguments,
     )
     assert idle.least_possible is not None  # the package has bounds of these plants
-    mean_error = float(-np.mean([episode.rewards for episode in episodes]))
+    mean_error = float(-np.mean([episode.rewards for episode in recorded]))
     buffers = [
         EpisodeBuffer(
             seed=episode.seed,
@@ -185,7 +150,7 @@ def _create(dataset_id: str, episodes: list[Episode]) -> str:
             terminations=[False] * SAMPLES,
             truncations=[*[False] * (SAMPLES - 1), True],
         )
-        for episode in episodes
+        for episode in recorded
     ]
     env = gymnasium.make("MiddlePoint-v0", max_episode_steps=SAMPLES, **arguments)
     dataset = minari.create_dataset_from_buffers(
@@ -212,7 +177,7 @@ def _create(dataset_id: str, episodes: list[Episode]) -> str:
         }
     )
     dataset.storage.update_episode_metadata(
-        [{"controller": episode.controller} for episode in episodes]
+        [{"controller": episode.controller} for episode in recorded]
     )
     return (
         f"mean |e| {mean_error:.3f} °C, least possible {idle.least_possible:.3f}, "
@@ -223,4 +188,4 @@ def _create(dataset_id: str, episodes: list[Episode]) -> str:
 main = command("datasets", Options, work)
 
 if __name__ == "__main__":
-    raise SystemExit(main(None))
+    raise SystemExit(main())

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from benchmarks.lib.command import Runs, blame, command, options
+from benchmarks.lib.command import CommandError, Count, command, options
 from mptc_gym import PRESETS
 
 EPISODE = 1200  # number of steps in an episode of the plant
@@ -40,24 +40,26 @@ class Options:
     ratio is that to the speed of the paper's plant in PyTorch.
     """
 
-    rounds: Runs = 15
+    rounds: Count = 15
     """The number of measurements of each case."""
     device: str | None = None
     """Measure only the PyTorch environment, on this device, such as cuda."""
 
 
-def work(options: Options) -> str:
-    """Measure speeds, print tables, and return the last line to print."""
+def work(options: Options) -> None:
+    """Measure speeds, and print a table for each number of plants."""
     from benchmarks.lib.report import on_screen
 
     numbers_of_plants = ON_DEVICE if options.device else BATCHES
-    with blame("--device"):
-        for n in numbers_of_plants:
+    for n in numbers_of_plants:
+        try:
             environments = make_environments(n, options.device)
-            cases = {name: stepping(env) for name, env in environments.items()}
-            table = on_screen(compare(cases, options.rounds))
-            print(f"\nn = {n:,}\n{table}", flush=True)
-    return f"Medians of {options.rounds} rounds; in parentheses, 10th to 90th percentile."
+        except ValueError as error:
+            raise CommandError(f"--device: {error}") from error
+        cases = {name: stepping(env) for name, env in environments.items()}
+        table = on_screen(compare(cases, options.rounds))
+        print(f"\nn = {n:,}\n{table}", flush=True)
+    print(f"Medians of {options.rounds} rounds; in parentheses, 10th to 90th percentile.")
 
 
 def make_environments(n: int, device: str | None) -> dict[str, Any]:
@@ -164,4 +166,4 @@ def compare(cases: Mapping[str, Case], rounds: int) -> Any:
 main = command("speed", Options, work)
 
 if __name__ == "__main__":
-    raise SystemExit(main(None))
+    raise SystemExit(main())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shlex
 from collections.abc import Mapping
@@ -13,19 +14,10 @@ import numpy as np
 
 from benchmarks.controllers.plant_scale import scale_of
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import (
-    Folder,
-    Parameter,
-    Runs,
-    blame,
-    command,
-    options,
-)
-from benchmarks.lib.parallel import progress_bar
-from benchmarks.lib.provenance import origin
-from benchmarks.lib.results import KeptResults, conditions_of, results_folder
+from benchmarks.lib.command import CommandError, Count, Folder, Parameter, command, options
+from benchmarks.lib.fan_out import with_progress_bar
+from benchmarks.lib.outputs import new_folder, provenance_of, write_csv, write_json
 from benchmarks.lib.seeds import SEEDS
-from benchmarks.lib.storage import write_csv, write_json
 from benchmarks.loop.rollout import mean_error, settled
 from benchmarks.loop.scenarios import Arguments, PlantOptions
 from mptc_gym import PRESETS, Parameters
@@ -108,50 +100,50 @@ class Options:
     All trials use the same set points and seeds. No comparison uses the set points and seeds of
     the trials. The best gains are written to the file `gains.json`. The command
     `benchmarks.compare --agent NAME=gains.json` runs the controller with the gains in the file.
-    If a search was stopped, the same command with the same code continues the search, to the
-    same result.
+    A search that was stopped goes on, to the same result, if --out names its folder.
     """
 
     controller: Annotated[str, Parameter(choices=SPANS)] = field(kw_only=False)
     """Name of the controller whose gains to search."""
-    trials: Runs = 800
-    """Number of sets of gains to try."""
-    runs: Runs = 100
+    trials: Count = 800
+    """Number of sets of gains to try, with those of a search that goes on."""
+    runs: Count = 100
     """Number of runs of each case in a trial."""
     plant: PlantOptions = field(default_factory=PlantOptions)
-    out: Folder = Path("results/tune")
+    out: Folder = None
 
 
-def work(options: Options) -> str:
-    """Search for gains, write the results, and return the last message for the user."""
-    from benchmarks.lib.report import Section, write_report
+def work(options: Options) -> None:
+    """Search for gains, write the results, and print a report."""
+    from benchmarks.lib.report import Section, show, write_report
 
-    provenance = origin()
     name = options.controller
     plant = options.plant.arguments()
     gains = [*spans_of(name, plant)]
-    target = options.out / name
-    with results_folder(target, conditions_of("tune", options)) as folder:
-        trials = search(name, plant, options.trials, options.runs, folder)
-        finalists = finals(name, plant, trials)
-        samples = options.runs * sum(case.samples for case in cases(plant).values())
-        budget = f"{len(trials)} trials: {len(trials) * samples / 1e6:.3g} M samples"
-        content = {
-            "controller": name,
-            "gains": finalists.loc[0, gains].to_dict(),
-            "plant": plant,
-            # A text for the column "prior knowledge" of the reports of `benchmarks.compare`.
-            "knows": "gains of a search on this plant",
-            "searched": f"{len(gains)} gains by {budget}",
-        }
-        write_json(folder / "gains.json", content)
-        title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS:,} new runs"
-        best = Section(title, [NOTE, FINALS_NOTE], finalists.map("{:.4g}".format))
-        fixed = Section("Gains before this search", [FIXED_NOTE], fixed_gains(name, plant))
-        write_report(folder, f"Gains: {ROSTER[name].label}", [best, fixed], provenance)
-    words = [*options.plant.command_line(), "--agent", f"my-{name}={target}/gains.json"]
-    return (
-        f"All trials are in {target}/trials.csv, and the best gains are in {target}/report.md. "
+    provenance = provenance_of(seeds={"sampler": SEED, "runs": FIRST_RUN})
+    folder = new_folder(options.out, f"tune-{name}", provenance, goes_on=True)
+    trials = search(name, plant, options.trials, options.runs, folder)
+    write_csv(folder / "trials.csv", trials)
+    finalists = finals(name, plant, trials)
+    samples = options.runs * sum(case.samples for case in cases(plant).values())
+    budget = f"{len(trials)} trials: {len(trials) * samples / 1e6:.3g} M samples"
+    content = {
+        "controller": name,
+        "gains": finalists.loc[0, gains].to_dict(),
+        "plant": plant,
+        # A text for the column "prior knowledge" of the reports of `benchmarks.compare`.
+        "knows": "gains of a search on this plant",
+        "searched": f"{len(gains)} gains by {budget}",
+    }
+    write_json(folder / "gains.json", content)
+    title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS:,} new runs"
+    best = Section(title, [NOTE, FINALS_NOTE], finalists.map("{:.4g}".format))
+    fixed = Section("Gains before this search", [FIXED_NOTE], fixed_gains(name, plant))
+    write_report(folder, f"Gains: {ROSTER[name].label}", [best, fixed], provenance)
+    show(best, fixed)
+    words = [*options.plant.command_line(), "--agent", f"my-{name}={folder}/gains.json"]
+    print(
+        f"All trials are in {folder}/trials.csv, and the best gains are in {folder}/report.md. "
         "The following command compares the best gains with other controllers: python -m "
         f"benchmarks.compare {shlex.join(words)}"
     )
@@ -199,11 +191,13 @@ def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
     """Return the range in which to search for each gain of a controller, by the gain's name.
 
     A range is a pair of values with the same sign: the value with the smallest magnitude, and
-    the value with the largest magnitude. A `UsageError` is raised if the plant has no gain or
+    the value with the largest magnitude. A `CommandError` is raised if the plant has no gain or
     time constant that defines the ranges.
     """
-    with blame("--plant"):
+    try:
         return SPANS[name](Parameters(**plant))
+    except ValueError as error:
+        raise CommandError(f"--plant: {error}") from error
 
 
 def cases(plant: Arguments) -> dict[str, TuningCase]:
@@ -256,9 +250,9 @@ def middle(plant: Parameters, name: str) -> float:
 def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> pd.DataFrame:
     """Try `count` sets of gains of a controller, and return a table of the results of `score`.
 
-    After an interruption, the file `trials.csv` in `folder` has the rows of the finished
-    trials. A search that starts again tries the same gains as before, and loads the results of
-    finished trials from `folder`.
+    The trials are stored in `folder`, trial by trial. A search that starts again goes on after
+    the stored trials of the same controller, plant and number of runs, and tries the gains that
+    it would have tried without an interruption.
 
     Parameters
     ----------
@@ -267,7 +261,7 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     plant
         Arguments of the environment for the plant.
     count
-        Number of trials.
+        Number of trials, with the stored trials.
     runs
         Number of runs of each case in a trial.
     folder
@@ -275,39 +269,39 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     """
     import optuna
     import pandas as pd
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
 
-    optuna.logging.set_verbosity(optuna.logging.CRITICAL)
-    study = optuna.create_study()
-    kept = KeptResults(folder)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(
+        storage=JournalStorage(JournalFileBackend(str(folder / "trials.log"))),
+        study_name=json.dumps([name, plant, runs]),
+        load_if_exists=True,
+    )
     spans = spans_of(name, plant)
     magnitudes: Any = {
         gain: optuna.distributions.FloatDistribution(abs(least), abs(most), log=True)
         for gain, (least, most) in spans.items()
     }
-    rows: list[dict[str, float]] = []
-    try:
-        with progress_bar("trials", count) as advance:
-            for i in range(count):
-                # With a new sampler in each trial, the gains of a trial depend on the results
-                # of earlier trials only, and not on where the search was interrupted.
-                study.sampler = optuna.samplers.TPESampler(
-                    seed=SEED + i, n_startup_trials=STARTUP, multivariate=True
-                )
-                trial = study.ask(magnitudes)
-                row = kept.load(f"trial {i}")
-                if row is None:
-                    gains = {}
-                    for gain, magnitude in trial.params.items():
-                        gains[gain] = math.copysign(magnitude, spans[gain][0])
-                    row = score(name, plant, runs, FIRST_RUN, gains)
-                    kept.save(f"trial {i}", row)
-                rows.append(row)
-                study.tell(trial, row["objective"])
-                advance()
-    finally:
-        if rows:
-            write_csv(folder / "trials.csv", pd.DataFrame(rows))
-    return pd.DataFrame(rows)
+    is_complete = [optuna.trial.TrialState.COMPLETE]
+    first = len(study.get_trials(states=is_complete))
+    for i in with_progress_bar(range(first, count), "trials", count - first):
+        # The gains of a trial depend on the results of earlier trials only, and not on where
+        # the search was interrupted: each trial has a new sampler, which ignores trials that
+        # have no result.
+        study.sampler = optuna.samplers.TPESampler(
+            seed=SEED + i, n_startup_trials=STARTUP, multivariate=True, constant_liar=False
+        )
+        trial = study.ask(magnitudes)
+        gains = {}
+        for gain, magnitude in trial.params.items():
+            gains[gain] = math.copysign(magnitude, spans[gain][0])
+        row = score(name, plant, runs, FIRST_RUN, gains)
+        trial.set_user_attr("row", row)
+        study.tell(trial, row["objective"])
+    return pd.DataFrame(
+        [trial.user_attrs["row"] for trial in study.get_trials(states=is_complete)]
+    )
 
 
 def score(
@@ -353,4 +347,4 @@ def score(
 main = command("tune", Options, work)
 
 if __name__ == "__main__":
-    raise SystemExit(main(None))
+    raise SystemExit(main())

@@ -17,6 +17,8 @@ from benchmarks.bounds.linear_program import equations, plan, reference, respons
 from benchmarks.bounds.prediction import noise_variance
 from benchmarks.bounds.unknown import error_bounds, load_changes
 from benchmarks.controllers.mpc import PredictiveController
+from benchmarks.lib.command import CommandError
+from benchmarks.lib.fan_out import Finished
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
@@ -350,11 +352,11 @@ class TestPredictiveController:
 
 
 def test_the_command_keeps_the_order_and_prints_what_was_ready(capsys, monkeypatch):
-    def last_first(_, tasks, *__):
-        yield from ((name, tasks[name]()) for name in reversed(tasks))
-        raise KeyboardInterrupt
+    def last_first(_, tasks, __):
+        results = {name: tasks[name]() for name in reversed(tasks)}
+        return Finished(results, CommandError("interrupted", 130))
 
-    monkeypatch.setattr(command.FanOut, "stream", last_first)
+    monkeypatch.setattr(command.FanOut, "run", last_first)
     monkeypatch.setenv("COLUMNS", "200")  # so that no table is broken
     for name, case in (("SCENARIOS", "constant"), ("PRESET_SCENARIOS", "dead-zone-7")):
         monkeypatch.setattr(command, name, {case: vars(command)[name][case]})

@@ -106,16 +106,15 @@ class TestCommand:
         out = tmp_path / "out"
         words = ["--jobs", "1", "--runs", "4", "--out", str(out), "noise", "direction"]
         assert main(words) == 1
-        assert not out.exists()
-        folder = tmp_path / "out.unfinished"
-        numbers = pd.read_csv(folder / "claims.csv")
+        numbers = pd.read_csv(out / "claims.csv")
         assert set(numbers["claim"]) == {"direction"}
         assert numbers["value"].iloc[1] == 100.0  # all of them diverge in the end ...
         assert numbers["shown"].iloc[1] == "undecided"  # ... but four prove little
-        printed = capsys.readouterr().out
-        assert "no weights" in printed
-        for text in (printed, (folder / "report.md").read_text()):
-            assert "Unfinished: 1 of 2 claims are missing." in text
+        printed = capsys.readouterr()
+        assert "1 of 2 tasks are missing\nnoise: ArithmeticError: no weights" in printed.err
+        page = (out / "report.md").read_text()
+        assert "Unfinished: 1 of 2 tasks are missing." in page
+        for text in (printed.out, page):
             assert "Training with -D(G) diverges at once" in text
 
     def test_short_runs_of_all_claims_give_the_numbers_that_they_gave(self, monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.compare.comparison import run_case
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.errors import UsageError
+from benchmarks.lib.command import CommandError
 from benchmarks.loop.rollout import make_plants, mean_error
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
@@ -132,7 +132,7 @@ class TestOwnControllers:
 
     @pytest.mark.parametrize("location", ["agents", "agents:No", "nowhere:x", ".:y", "..a:y"])
     def test_bad_locations(self, location):
-        with pytest.raises(UsageError, match=f"--agent: .*{re.escape(location)}' "):
+        with pytest.raises(CommandError, match=f"--agent: .*{re.escape(location)}' "):
             members_of(location)
 
     @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ class TestOwnControllers:
         ],
     )
     def test_bad_ones(self, code, complaint, written):
-        with pytest.raises(UsageError, match=complaint) as error:
+        with pytest.raises(CommandError, match=complaint) as error:
             members_of(written(code))[0].run({"delay": 3}, 2, 2, 0)
         # A traceback follows where the user's code has failed.
         has_traceback = "Traceback" in str(error.value)

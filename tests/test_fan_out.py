@@ -3,107 +3,97 @@
 import os
 import secrets
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from functools import partial
-from pathlib import Path
-from unittest.mock import Mock
 
-import joblib
 import numpy as np
 import pytest
 
-from benchmarks.lib.errors import UnfinishedError, UsageError
-from benchmarks.lib.parallel import FanOut
+from benchmarks.lib import fan_out
+from benchmarks.lib.command import CommandError
+from benchmarks.lib.fan_out import FanOut
 from tests.conftest import ROOT, python
 
 
 def draw(seed, seconds=0.0):
     """Return a random number of a seed, after some time."""
     time.sleep(seconds)
-    return [{"seed": seed, "drawn": np.random.default_rng(seed).normal()}]
+    return np.random.default_rng(seed).normal()
 
 
 def die_of_memory():
     """Kill the own process as the system does if memory runs out."""
+    time.sleep(1.0)  # until the other tasks have finished
     os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # as Windows has it
 
 
-def fail(seed):
+def fail():
     """Raise an exception that cannot be pickled."""
 
     class LocalError(Exception):
         pass
 
-    raise LocalError(f"no such plant as {seed}")
+    raise LocalError("no such plant")
 
 
-def work(n):
-    return {f"plant {seed}": partial(draw, seed) for seed in range(n)}
+def stop():
+    raise KeyboardInterrupt
 
 
-def run(tasks, jobs=2):
-    return dict(FanOut(jobs=jobs).stream(tasks, "tasks"))
+WORK = {f"plant {seed}": partial(draw, seed) for seed in range(5)}
+RESULTS = {name: task() for name, task in WORK.items()}
 
 
 def test_jobs_and_order_do_not_matter():
-    tasks = work(5)
-    tasks["plant 0"] = partial(draw, 0, 0.3)  # The first task is not ready first.
-    reversed_tasks = dict(reversed(tasks.items()))
-    for ordered_tasks, jobs in ((tasks, 1), (tasks, 2), (reversed_tasks, 2)):
-        results = run(ordered_tasks, jobs=jobs)
-        assert results == {f"plant {seed}": draw(seed) for seed in range(5)}
-    assert run({"pid": os.getpid}, jobs=1) == {"pid": os.getpid()}
-    assert os.getpid() not in run({"one": os.getpid, "two": os.getpid}).values()
+    slow = WORK | {"plant 0": partial(draw, 0, 0.3)}  # The first task is not ready first.
+    for tasks, jobs in ((slow, 1), (slow, 2), (dict(reversed(slow.items())), 2)):
+        assert FanOut(jobs=jobs).run(tasks, "tasks") == (RESULTS, None)
+    processes = FanOut(jobs=2).run({"one": os.getpid, "two": os.getpid}, "tasks").results
+    assert os.getpid() not in processes.values()
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_exception_names_its_task_and_spares_the_others(jobs):
-    faulty = {"the fault": partial(fail, 3), "left": partial(sys.exit, 3)}
-    done = {}
-    with pytest.raises(UnfinishedError, match="no such plant as 3") as error:
-        done.update(FanOut(jobs=jobs).stream({**faulty, **work(4)}, "tasks"))
-    assert "2 of 6 tasks failed" in str(error.value)
-    assert "left: SystemExit: 3" in str(error.value)
-    assert done == {f"plant {seed}": draw(seed) for seed in range(4)}
+    saved = {}
+    finished = FanOut(jobs=jobs).run({"the fault": fail} | WORK, "tasks", saved.setdefault)
+    assert finished.results == saved == RESULTS
+    first, second, *traceback = str(finished.error).splitlines()
+    assert first == "1 of 6 tasks are missing"
+    assert second.startswith("the fault: ")
+    assert second.endswith("LocalError: no such plant")
+    assert traceback[0] == "Traceback (most recent call last):"
+    assert finished.error.status == 1
 
 
-def refuse():
-    raise UsageError("--agent: a controller cannot be run: no reason\n\nTraceback of the user")
+def test_after_an_interruption_what_has_finished_is_kept():
+    finished = FanOut(jobs=1).run(WORK | {"Ctrl-C": stop, "later": fail}, "tasks")
+    assert finished.results == RESULTS
+    assert str(finished.error) == "interrupted: 2 of 7 tasks are missing"
+    assert finished.error.status == 130
+    with pytest.raises(CommandError, match="interrupted: 6 of 6 tasks are missing"):
+        FanOut(jobs=1).run({"Ctrl-C": stop} | WORK, "tasks")
 
 
-def test_an_error_of_the_user_is_listed_by_its_first_line():
-    with pytest.raises(UnfinishedError) as error:
-        run({"mine, square": refuse, "mine, constant": refuse}, jobs=1)
-    lines = str(error.value).splitlines()
-    assert lines[1:3] == [
-        "mine, square: --agent: a controller cannot be run: no reason",
-        "mine, constant: --agent: a controller cannot be run: no reason",
-    ]
-    assert lines[-1] == "Traceback of the user"
-
-
-def test_a_killed_process_is_a_sentence():
-    with pytest.raises(
-        UnfinishedError, match="killed, perhaps because memory ran out: try fewer"
-    ):
-        run({**work(2), "the killer": die_of_memory})
-    assert run(work(2))  # with new processes
+def test_a_process_that_was_killed_costs_no_result_of_the_others():
+    finished = FanOut(jobs=2).run({**WORK, "the killer": die_of_memory}, "tasks")
+    assert finished.results == RESULTS
+    assert "1 of 6 tasks are missing" in str(finished.error)
+    assert FanOut(jobs=2).run(WORK, "tasks") == (RESULTS, None)  # with new processes
 
 
 RAY = """
 import os
 from functools import partial
 from ray.cluster_utils import Cluster
-from benchmarks.lib.parallel import FanOut
+from benchmarks.lib.fan_out import FanOut
 node = {"num_cpus": 2, "object_store_memory": 80_000_000, "include_dashboard": False}
 cluster = Cluster(initialize_head=True, head_node_args=node)
 os.environ["RAY_ADDRESS"] = cluster.address
 work = {f"plant {seed}": partial(pow, 0.1, seed) for seed in range(3)} | {"where": os.getpid}
-there = dict(FanOut(backend="ray").stream(work, "on the cluster"))
-here = dict(FanOut(jobs=1).stream(work, "here"))
+there = FanOut(backend="ray").run(work, "on the cluster").results
+here = FanOut(jobs=1).run(work, "here").results
 assert there.pop("where") != here.pop("where") and there == here, there
 print("the same numbers")
 cluster.shutdown()
@@ -127,61 +117,9 @@ def test_a_cluster_gives_the_numbers_that_one_process_gives():
     assert "the same numbers" in done.stdout, done.stderr
 
 
-def test_where_there_is_no_cluster_it_says_so(monkeypatch):
-    pytest.importorskip("ray", reason="Ray is not installed")
-    monkeypatch.setenv("RAY_ADDRESS", "nowhere")  # "auto" would find those of other users
-    with pytest.raises(UsageError, match="--backend: no Ray cluster can be reached: start one"):
-        dict(FanOut(backend="ray").stream(work(1), "tasks"))
-
-
-def test_an_error_of_joblib_leaves_the_signals_as_they_were(monkeypatch):
-    before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(joblib.Parallel, "__call__", Mock(side_effect=OSError("no semaphores")))
-    with pytest.raises(OSError, match="no semaphores"):
-        run(work(3))
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-ORPHANS = """
-import os, pathlib, sys, time
-from functools import partial
-from benchmarks.lib.parallel import FanOut
-
-def wait(folder):
-    (folder / str(os.getpid())).touch()
-    time.sleep(120)
-
-folder = pathlib.Path(sys.argv[1])
-dict(FanOut(jobs=2).stream({name: partial(wait, folder) for name in "ab"}, "tasks"))
-"""
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_processes_end_when_the_one_that_started_them_is_killed(tmp_path):
-    parent = subprocess.Popen([sys.executable, "-c", ORPHANS, tmp_path], cwd=ROOT)
-
-    def begun():
-        return [path.name for path in tmp_path.iterdir()]
-
-    assert wait_until(lambda: len(begun()) == 2)
-    parent.kill()
-    parent.wait()
-    assert wait_until(lambda: not any(is_running(number) for number in begun()), seconds=15)
-
-
-def wait_until(condition, seconds=60):
-    """Return whether a condition comes true in time."""
-    for _ in range(10 * seconds):
-        if condition():
-            return True
-        time.sleep(0.1)
-    return False
-
-
-def is_running(process):
-    """Return whether a process runs; one that ended may wait for its parent to ask for it."""
-    try:
-        status = Path("/proc", process, "stat").read_text()
-    except OSError:
-        return False
-    return status.rpartition(")")[2].split()[0] != "Z"
+def test_the_bar_is_shown_on_a_terminal_alone(capsys, monkeypatch):
+    assert list(fan_out.with_progress_bar("ab", "tasks", 2)) == ["a", "b"]
+    assert capsys.readouterr().err == ""
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich then takes any stream for a terminal
+    assert list(fan_out.with_progress_bar("ab", "tasks", 2)) == ["a", "b"]
+    assert "tasks" in capsys.readouterr().err

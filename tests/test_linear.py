@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from agents import DahlinController, PIController, SmithPredictor
-from benchmarks.lib.errors import UsageError
+from benchmarks.lib.command import CommandError
 from benchmarks.loop.linear import LinearLoop, nominal, step_test, time_constant_for
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.loop.scenarios import PlantOptions
@@ -86,7 +86,7 @@ def test_bad_plant_file_is_named(tmp_path):
     }.items():
         if text is not None:
             path.write_text(text)
-        with pytest.raises(UsageError, match=f"^--plant: .*{complaint}"):
+        with pytest.raises(CommandError, match=f"^--plant: .*{complaint}"):
             PlantOptions(plant=path).arguments()
 
 

@@ -60,7 +60,7 @@ EXAMPLES = [
 
 
 COMPARE = {  # the packages of the extra "compare"
-    "cyclopts", "filelock", "joblib", "matplotlib", "pandas", "rich", "scipy", "tabulate",
+    "cyclopts", "joblib", "matplotlib", "pandas", "rich", "scipy", "tabulate",
 }  # fmt: skip
 
 

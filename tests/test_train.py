@@ -40,16 +40,22 @@ def small(monkeypatch):
         monkeypatch.setitem(sb3.SETTINGS, name, value)
 
 
-def test_the_command_lists_trainings_by_their_seeds(tmp_path, capsys, monkeypatch):
+def test_the_command_trains_what_is_missing_and_lists_all_by_their_seeds(
+    tmp_path, capsys, monkeypatch
+):
     short = {
         "plants": (ppo.TrainingPlants(64, {}),),
         "cases": {"short": {"max_episode_steps": 20}},
     }
     monkeypatch.setitem(ppo.RECIPES, "ppo", replace(ppo.RECIPES["ppo"], **short))
-    arguments = ["ppo", "--networks", "2", "--steps", "8", "--jobs", "1", "--out"]
-    assert program.main([*arguments, str(tmp_path)]) == 0
+    words = f"ppo --steps 8 --jobs 1 --out {tmp_path}".split()
+    assert program.main([*words, "--networks", "1"]) == 0
+    first = tmp_path / "ppo-10000.npz"
+    written = first.stat().st_mtime_ns
+    assert program.main([*words, "--networks", "2"]) == 0
+    assert first.stat().st_mtime_ns == written
     assert {"10000", "10001"} <= set(capsys.readouterr().out.split())
-    assert {file.stem for file in tmp_path.glob("ppo/*.npz")} == {"ppo-10000", "ppo-10001"}
+    assert {file.name for file in tmp_path.glob("*.npz")} == {"ppo-10000.npz", "ppo-10001.npz"}
 
 
 def weights(network):
@@ -175,7 +181,7 @@ class TestOtherPlants:
         monkeypatch.setitem(ppo.RECIPES, "ppo", short)
         given = "ppo --networks 2 --steps 8 --jobs 1 --set b=[0.0456,0.00404] --set u_max=12"
         assert program.main([*given.split(), "--out", str(tmp_path)]) == 0
-        files = sorted(tmp_path.glob("ppo-plant/*.npz"))
+        files = sorted(tmp_path.glob("ppo-plant-*.npz"))
         assert len(files) == 2
         (spec,) = chosen([], [f"mine={file}" for file in files]).values()
         assert [each.provenance["file"] for each in spec.members()] == [*map(str, files)]

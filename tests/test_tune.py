@@ -2,7 +2,6 @@
 
 import json
 import re
-from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -14,7 +13,7 @@ from benchmarks import tune
 from benchmarks.controllers.options import chosen
 from benchmarks.controllers.plant_scale import NN_SPANS, PI_SPANS
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.errors import UsageError
+from benchmarks.lib.command import CommandError
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import Parameters
 from tests.conftest import ROOT
@@ -43,12 +42,11 @@ def short(monkeypatch):
         monkeypatch.setitem(tune.CASES, name, case._replace(samples=60, first=0))
 
 
-def search(out, runs=2, status=0):
-    """Run a search, and return its trials, which stay apart if it has not finished."""
-    words = f"pi --trials 6 --runs {runs} --out {out}"
-    assert tune.main(words.split()) == status
-    folder = out / "pi.unfinished" if status else out / "pi"
-    return pd.read_csv(folder / "trials.csv")
+def search(out, trials=6, runs=2):
+    """Run a search, and return its trials."""
+    words = f"pi --trials {trials} --runs {runs} --out {out}"
+    assert tune.main(words.split()) == 0
+    return pd.read_csv(out / "trials.csv")
 
 
 def tables_of(page):
@@ -103,7 +101,7 @@ class TestOtherPlants:
 def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path):
     plant = tmp_path / "plant.json"
     plant.write_text(json.dumps({"b": [0.0456, 0.00404]}))
-    words = f"pi --trials 3 --runs 2 --plant {plant} --out {tmp_path}"
+    words = f"pi --trials 3 --runs 2 --plant {plant} --out {tmp_path}/pi"
     assert tune.main(words.split()) == 0
     file = tmp_path / "pi/gains.json"
     gains = json.loads(file.read_text())["gains"]
@@ -114,21 +112,21 @@ def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path):
     assert "positive feedback" in spec.misfit(falling)
     controller = spec.make({"b": [0.0456, 0.00404]}, 1, 0)
     assert (controller.kp, controller.ki) == (gains["kp"], gains["ki"])
-    with pytest.raises(UsageError, match=r"'mine' must be one gains\.json or several \.npz"):
+    with pytest.raises(CommandError, match=r"'mine' must be one gains\.json or several \.npz"):
         chosen([], [f"mine={file}"] * 2)
     file.write_text('{"controller": "pi"}')
-    with pytest.raises(UsageError, match=r"--agent: mine=.* must be a gains\.json"):
+    with pytest.raises(CommandError, match=r"--agent: mine=.* must be a gains\.json"):
         chosen([], [f"mine={file}"])
 
 
 @pytest.mark.usefixtures("short")
 class TestSearch:
     def test_finalists_are_judged_rounded_on_new_runs(self, tmp_path, capsys):
-        trials = search(tmp_path)
+        trials = search(tmp_path / "search")
         assert len(trials) == 6
         assert trials["kp"].between(*PI_SPANS["kp"]).all()
         assert "The best" in capsys.readouterr().out
-        best, fixed = tables_of(tmp_path / "pi/report.md")
+        best, fixed = tables_of(tmp_path / "search/report.md")
         assert len(best) == 2
         for kp, ki, *_, objective, in_search in best:
             assert objective == pytest.approx(final_objective(kp, ki), rel=1e-3)
@@ -140,41 +138,23 @@ class TestSearch:
         for _, _, kp, ki, objective in fixed:
             assert objective == pytest.approx(final_objective(kp, ki), rel=1e-3)
 
-    def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch, capsys):
-        uninterrupted, judge, calls = search(tmp_path / "whole"), tune.settled, []
+    def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch):
+        uninterrupted, score, calls = search(tmp_path / "whole"), tune.score, []
 
-        def settled(runs):  # called once a trial
-            calls.append(runs)
+        def score_or_stop(*arguments):
+            calls.append(arguments)
             if len(calls) == 5:
                 raise KeyboardInterrupt
-            return judge(runs)
+            return score(*arguments)
 
-        monkeypatch.setattr(tune, "settled", settled)
-        assert len(search(tmp_path / "halves", status=130)) == 4
-        assert "Interrupted" in capsys.readouterr().out
-        assert not (tmp_path / "halves/pi").exists()
-        assert search(tmp_path / "halves").equals(uninterrupted)
-        assert len(calls) == 5 + 2 + 2 + 2  # 4 are kept; then 2 finalists, 2 fixed gains
-
-    def test_one_that_is_stopped_before_its_first_trial_changes_nothing(
-        self, tmp_path, monkeypatch
-    ):
-        search(tmp_path)
-        before = {file.name: file.read_bytes() for file in (tmp_path / "pi").iterdir()}
-        monkeypatch.setattr(tune, "score", Mock(side_effect=KeyboardInterrupt))
-        assert tune.main(["pi", "--trials", "6", "--out", str(tmp_path)]) == 130
-        assert {file.name: file.read_bytes() for file in (tmp_path / "pi").iterdir()} == before
-        assert not (tmp_path / "pi.unfinished").exists()
-
-    def test_what_was_kept_of_another_search_is_not_used(self, tmp_path, monkeypatch):
-        score = tune.score
-        fails_at_third = Mock(
-            side_effect=[*(score("pi", {}, 2, 0, {}),) * 2, KeyboardInterrupt]
-        )
-        monkeypatch.setattr(tune, "score", fails_at_third)
-        search(tmp_path, runs=2, status=130)
-        monkeypatch.setattr(tune, "score", score)
-        assert search(tmp_path, runs=1).equals(search(tmp_path / "other", runs=1))
+        monkeypatch.setattr(tune, "score", score_or_stop)
+        out = tmp_path / "parts"
+        assert tune.main(f"pi --trials 6 --runs 2 --out {out}".split()) == 130
+        calls *= 2  # 10 calls: no further stop
+        search(out, runs=1)  # A search with other runs has no influence.
+        before = len(calls)
+        assert search(out).equals(uninterrupted)
+        assert len(calls) == before + 2 + 2 + 2  # 4 are kept; then 2 finalists, 2 fixed gains
 
 
 def test_the_pages_of_the_searches_name_the_gains_of_other_commands():

@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from benchmarks.lib.command import Count, Runs, Seed, command, options
-from benchmarks.lib.errors import NoBoundError
-from benchmarks.lib.parallel import FanOut
-from benchmarks.lib.provenance import ROOT, commit, versions
-from benchmarks.lib.storage import write_json
+from benchmarks.lib.command import Count, Seed, command, options
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.outputs import ROOT, commit, versions, write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions, Scenario
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import (
@@ -69,7 +67,7 @@ class Options:
     `python -m benchmarks.compare` and the presets of the environment.
     """
 
-    mpc: Runs | None = None
+    mpc: Count | None = None
     """Number of runs of each case with model predictive control, whose mean error is added."""
     package: bool = False
     """Instead of the table, write the file of bounds that ships with the package mptc_gym."""
@@ -83,12 +81,12 @@ class Options:
     """Seed of the first episode; each later episode has the next seed."""
 
 
-def work(options: Options) -> str:
-    """Print a table of least possible mean errors, and return an explanation of the columns.
+def work(options: Options) -> None:
+    """Print a table of least possible mean errors, and an explanation of the columns.
 
     If an error or an interruption ends the computation, the printed table has only the cases
     that are finished. With the option `--package`, write the file `mptc_gym/bounds.json`
-    instead, and return a text with the path of the file.
+    instead.
     """
     import pandas as pd
 
@@ -96,20 +94,19 @@ def work(options: Options) -> str:
 
     cases = options.plant.cases(SCENARIOS | PRESET_SCENARIOS)
     if options.package:
-        return write_package(options.fan_out)
+        write_package(options.fan_out)
+        return
     tasks = {name: partial(row, case, options) for name, case in cases.items()}
     title = "Mean absolute error in °C"
     if options.plant.name:
         title += f", plant: {options.plant.name}"
-    print(f"{title}:")
-    rows: dict[str, dict[str, str]] = {}
-    try:
-        rows.update(options.fan_out.stream(tasks, "bounds"))
-    finally:
-        if rows:
-            table = pd.DataFrame([rows[name] for name in tasks if name in rows])
-            print(on_screen(table), flush=True)
-    return description()
+    print(f"{title}:", flush=True)
+    finished = options.fan_out.run(tasks, "bounds")
+    rows = [finished.results[name] for name in tasks if name in finished.results]
+    print(on_screen(pd.DataFrame(rows)))
+    print(description())
+    if finished.error:
+        raise finished.error
 
 
 def description() -> str:
@@ -129,6 +126,7 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
     for the column "reference" if the set point changes before the plant has settled.
     """
     from benchmarks.bounds.least import least_possible
+    from benchmarks.bounds.linear_program import NoBoundError
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.lib.statistics import bootstrap
     from benchmarks.loop.rollout import mean_error
@@ -153,13 +151,15 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
     return cells
 
 
-def write_package(fan_out: FanOut) -> str:
-    """Write the file `mptc_gym/bounds.json`, and return a text with the path of the file.
+def write_package(fan_out: FanOut) -> None:
+    """Write the file `mptc_gym/bounds.json`, and print its path.
 
     `fan_out` distributes the cases of `PACKAGED` to worker processes.
     """
     tasks = {name: partial(packaged_case, arguments) for name, arguments in PACKAGED.items()}
-    cases = dict(fan_out.stream(tasks, "bounds"))
+    finished = fan_out.run(tasks, "bounds")
+    if finished.error:
+        raise finished.error
     content = {
         "command": "python -m benchmarks.bounds --package",
         "commit": commit(),
@@ -170,10 +170,10 @@ def write_package(fan_out: FanOut) -> str:
         "episodes": PACKAGED_EPISODES,
         "validation_seed": VALIDATION_SEED,
         "validation_episodes": VALIDATION_EPISODES,
-        "cases": {name: cases[name] for name in PACKAGED},
+        "cases": {name: finished.results[name] for name in PACKAGED},
     }
     write_json(PACKAGE_FILE, content)
-    return f"Written to {PACKAGE_FILE}"
+    print(f"Written to {PACKAGE_FILE}")
 
 
 def packaged_case(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -199,4 +199,4 @@ def packaged_case(arguments: dict[str, Any]) -> dict[str, Any]:
 main = command("bounds", Options, work)
 
 if __name__ == "__main__":
-    raise SystemExit(main(None))
+    raise SystemExit(main())

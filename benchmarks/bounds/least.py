@@ -24,11 +24,11 @@ from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.linear_program import (
     LOOKAHEAD,
     TRAVEL_PRICE,
+    NoBoundError,
     plan,
     reference,
 )
 from benchmarks.bounds.unknown import error_bounds
-from benchmarks.lib.errors import NoBoundError
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import (

@@ -8,7 +8,6 @@ import numpy as np
 import scipy  # loads its modules on first use
 from numpy.typing import ArrayLike, NDArray
 
-from benchmarks.lib.errors import NoBoundError
 from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.rollout import held
 
@@ -33,6 +32,14 @@ LOOKAHEAD = 60
 # t/h of valve travel, the valve moves no more than needed.
 SMALLEST_SLOPE = 0.001
 TRAVEL_PRICE = 1e-4
+
+
+class NoBoundError(ValueError):
+    """A case has no least possible error of the requested kind.
+
+    For example, a least possible error of the kind "reference" exists only if the plant settles
+    before each change of the set point.
+    """
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,10 @@
 
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from typing import Any
 
-from benchmarks.lib.command import Folder, Names, Runs, command, known, options
-from benchmarks.lib.parallel import FanOut
-from benchmarks.lib.provenance import origin
-from benchmarks.lib.results import results_folder
-from benchmarks.lib.storage import write_csv
+from benchmarks.lib.command import Count, Folder, Names, command, known, options
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.outputs import new_folder, provenance_of, write_csv
 
 
 @options
@@ -22,45 +18,38 @@ class Options:
 
     claims: Names = field(default=(), kw_only=False)
     """Claims to test (default: all)."""
-    runs: Runs = 1000
+    runs: Count = 1000
     """The number of runs of each case."""
     fan_out: FanOut = field(default_factory=FanOut)
-    out: Folder = Path("results/claims")
+    out: Folder = None
 
 
-def work(options: Options) -> str:
-    """Test claims of the paper, write a report, and return a message with its path.
-
-    If the test of a claim raises an error, the report on the finished tests is written before
-    the error is raised again.
-    """
+def work(options: Options) -> None:
+    """Test claims of the paper, write a report on those that could be tested, and print it."""
     from benchmarks.claims.claims import CLAIMS, examined
     from benchmarks.claims.findings import sections, table
     from benchmarks.claims.runs import Batch
-    from benchmarks.lib.report import write_report
+    from benchmarks.lib.report import show, write_report
 
-    names = known("CLAIM", options.claims or list(CLAIMS), list(CLAIMS))
-    provenance = origin()
+    names = known("CLAIM", options.claims or list(CLAIMS), CLAIMS)
+    batch = Batch(options.runs)
+    provenance = provenance_of(seeds={"first": batch.seed, "runs": batch.runs})
+    folder = new_folder(options.out, "claims", provenance)
     # The tests of the last claims take longest, so these tests start first.
-    tasks = {name: partial(examined, name, Batch(options.runs)) for name in reversed(names)}
-    findings: dict[str, Any] = {}
-    with results_folder(options.out) as folder:
-        try:
-            findings.update(options.fan_out.stream(tasks, "claims"))
-        finally:
-            missing = len(tasks) - len(findings)
-            if missing:
-                provenance["missing"] = f"{missing} of {len(tasks)} claims are missing"
-            if findings:
-                in_order = {name: findings[name] for name in names if name in findings}
-                numbers = table(CLAIMS, in_order)
-                report = sections(CLAIMS, numbers)
-                write_csv(folder / "claims.csv", numbers)
-                write_report(folder, "The paper's claims", report, provenance, printed=1)
-    return f"All numbers are in {options.out}/report.md and claims.csv"
+    tasks = {name: partial(examined, name, batch) for name in reversed(names)}
+    finished = options.fan_out.run(tasks, "claims")
+    in_order = {name: finished.results[name] for name in names if name in finished.results}
+    numbers = table(CLAIMS, in_order)
+    report = sections(CLAIMS, numbers)
+    write_csv(folder / "claims.csv", numbers)
+    write_report(folder, "The paper's claims", report, provenance, finished.error)
+    show(report[0])
+    print(f"All numbers are in {folder}/report.md and claims.csv")
+    if finished.error:
+        raise finished.error
 
 
 main = command("claims", Options, work)
 
 if __name__ == "__main__":
-    raise SystemExit(main(None))
+    raise SystemExit(main())

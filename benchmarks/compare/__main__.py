@@ -2,16 +2,22 @@
 
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Any
 
 from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import Folder, Names, Parameter, Runs, Seed, command, known, options
-from benchmarks.lib.errors import UsageError
-from benchmarks.lib.provenance import origin
-from benchmarks.lib.results import results_folder
-from benchmarks.lib.storage import write_json
+from benchmarks.lib.command import (
+    CommandError,
+    Count,
+    Folder,
+    Names,
+    Parameter,
+    Seed,
+    command,
+    known,
+    options,
+)
+from benchmarks.lib.outputs import new_folder, provenance_of
 from benchmarks.loop.scenarios import (
     PRESET_SCENARIOS,
     SCENARIOS,
@@ -26,10 +32,6 @@ _SCENARIOS_HELP = (
     f"--presets, the cases are {', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set, "
     f"the cases are {', '.join(setpoint.name for setpoint in SETPOINTS)}."
 )
-_OUT_HELP = (
-    "The folder to write to (default: results/compare; results/compare-presets with --presets; "
-    "results/compare-plant with --plant, --preset or --set)."
-)
 
 
 @options
@@ -43,26 +45,30 @@ class Options:
     plant: PlantOptions = field(default_factory=PlantOptions)
     presets: bool = False
     """Run a case for each preset of the environment instead of the default cases."""
-    runs: Runs = 100
+    runs: Count = 100
     """The number of runs of each controller in each case."""
     seed: Seed = SEED
     """The seed of the first run (default: the seed of the first published episode)."""
-    out: Annotated[Folder | None, Parameter(help=_OUT_HELP)] = None
+    out: Folder = None
 
 
-def work(options: Options) -> str:
-    """Compare controllers, write the results, and return a sentence that names their folder.
+def work(options: Options) -> None:
+    """Compare controllers, write the results, and print the main tables.
 
     If a task fails or the user interrupts the comparison, the results of all finished tasks are
-    written before the exception is raised again.
+    written before an error is raised.
     """
     from benchmarks.compare.comparison import run_case, scale_of
     from benchmarks.compare.report import write
 
     controllers = chosen(options.agents, options.controllers.agent)
     folder_name, scenarios = cases(options)
-    target = options.out or Path("results", folder_name)
-    provenance = origin()
+    provenance = provenance_of(
+        options={**asdict(options), "agents": list(controllers)},
+        seeds=list(range(options.seed, options.seed + options.runs)),
+        scenarios={scenario.name: vars(scenario) for scenario in scenarios},
+    )
+    folder = new_folder(options.out, folder_name, provenance)
     # Names of tasks are, for example, "bounds of square" and "mpc, square".
     bound_tasks: dict[str, Any] = {}
     run_tasks: dict[str, Any] = {}
@@ -78,38 +84,24 @@ def work(options: Options) -> str:
     # task is a scenario.
     names = sorted(tasks, key=lambda name: -tasks[name].args[0].samples)
     sorted_tasks = {name: tasks[name] for name in names}
-    finished: dict[str, Any] = {}
-    with results_folder(target) as folder:
-        try:
-            finished.update(options.controllers.fan_out.stream(sorted_tasks, "compare"))
-        finally:
-            missing = len(tasks) - len(finished)
-            if missing:
-                provenance["missing"] = f"{missing} of {len(tasks)} tasks are missing"
-            results = [finished[name] for name in run_tasks if name in finished]
-            scales = [finished[name] for name in bound_tasks if name in finished]
-            if results:
-                policies = {result.agent: result.policies for result in results}
-                content = {
-                    **provenance,
-                    "options": {**asdict(options), "agents": list(controllers)},
-                    "seeds": list(range(options.seed, options.seed + options.runs)),
-                    "scenarios": {scenario.name: vars(scenario) for scenario in scenarios},
-                    "policies": {name: policies[name] for name in policies if policies[name]},
-                }
-                write_json(folder / "provenance.json", content)
-                write(results, scales, controllers, folder, provenance)
-    return f"The report, tables, data and plots are in {target}/"
+    finished = options.controllers.fan_out.run(sorted_tasks, "compare")
+    results = [finished.results[name] for name in run_tasks if name in finished.results]
+    scales = [finished.results[name] for name in bound_tasks if name in finished.results]
+    if results:
+        write(results, scales, controllers, folder, provenance, finished.error)
+        print(f"The report, tables, data and plots are in {folder}/")
+    if finished.error:
+        raise finished.error
 
 
 def cases(options: Options) -> tuple[str, list[Scenario]]:
     """Return the name of the default output folder in `results/`, and the scenarios to run.
 
-    A `UsageError` is raised if `options` has options that exclude each other, or the name of an
-    unknown scenario.
+    A `CommandError` is raised if `options` has options that exclude each other, or the name of
+    an unknown scenario.
     """
     if options.presets and options.plant.name:
-        raise UsageError("--presets cannot be combined with --plant, --preset and --set")
+        raise CommandError("--presets cannot be combined with --plant, --preset and --set")
     if options.presets:
         folder_name, available = "compare-presets", PRESET_SCENARIOS
     elif options.plant.name:
@@ -119,7 +111,7 @@ def cases(options: Options) -> tuple[str, list[Scenario]]:
     wanted = list(available) if options.scenarios is None else options.scenarios
     scenarios = [available[name] for name in known("--scenarios", wanted, available)]
     if not scenarios:
-        raise UsageError("--scenarios: name at least one case")
+        raise CommandError("--scenarios: name at least one case")
     return folder_name, scenarios
 
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from benchmarks.bounds.least import LeastPossible, least_possible
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.controllers.spec import ControllerSpec
+from benchmarks.lib.outputs import write_csv
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles
-from benchmarks.lib.storage import write_csv
 from benchmarks.loop.rollout import Trajectory, is_random, measure
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters

@@ -19,7 +19,8 @@ from benchmarks.compare.comparison import (
 )
 from benchmarks.controllers.roster import label
 from benchmarks.controllers.spec import ControllerSpec
-from benchmarks.lib.report import Section, write_report
+from benchmarks.lib.command import CommandError
+from benchmarks.lib.report import Section, show, write_report
 from benchmarks.lib.statistics import Estimate, as_text
 from benchmarks.loop.rollout import RESPONSE_SAMPLES, START_SAMPLES
 from benchmarks.loop.scenarios import Scenario
@@ -129,13 +130,15 @@ def write(
     scales: Sequence[Scale],
     controllers: Mapping[str, ControllerSpec],
     folder: Path,
-    origin: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+    error: CommandError | None,
 ) -> None:
     """Write the CSV files, pictures and report of a comparison, and print the main tables.
 
     A scenario whose least possible errors are not in `scales` is written to the CSV files, but
     not to the report. `controllers` has the record (`ControllerSpec`) of each controller by
-    name, and `origin` is the provenance of the results, as `provenance.origin` returns it.
+    name, `provenance` is the provenance of the results, as `provenance_of` returns it, and
+    `error` says which results are missing.
     """
     runs = pd.concat([result.runs for result in results], ignore_index=True)
     write_numbers(folder / "runs.csv", runs)
@@ -166,7 +169,9 @@ def write(
         scores=ranked(estimates, misfits),
     )
     draw(comparison, responses, folder)
-    write_report(folder, "Comparison of controllers", sections(comparison), origin, printed=2)
+    page = sections(comparison)
+    write_report(folder, "Comparison of controllers", page, provenance, error)
+    show(*page[:2])
 
 
 def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:

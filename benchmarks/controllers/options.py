@@ -17,9 +17,8 @@ from agents import PolicyNetwork
 from benchmarks.controllers.own import OwnController, make_controller
 from benchmarks.controllers.roster import OWN_LOOKS, ROSTER
 from benchmarks.controllers.spec import EVERYTHING, LIMITS, ControllerSpec
-from benchmarks.lib.command import Names, Parameter, known, options
-from benchmarks.lib.errors import UsageError
-from benchmarks.lib.parallel import FanOut
+from benchmarks.lib.command import CommandError, Names, Parameter, known, options
+from benchmarks.lib.fan_out import FanOut
 
 AgentNames = Annotated[
     Names, Parameter(help=f"The controllers to run, from {', '.join(ROSTER)}.")
@@ -62,12 +61,12 @@ def chosen(
 
     Raises
     ------
-    UsageError
+    CommandError
         If no controller is chosen, if a controller's name is unknown or taken, or if the
         location of a user's controller does not exist.
     """
     if not (names or user_controllers):
-        raise UsageError("--agents, --agent: name at least one controller")
+        raise CommandError("--agents, --agent: name at least one controller")
     specs = {name: ROSTER[name] for name in known("--agents", names, ROSTER)}
     locations_of: dict[str, list[str]] = {}
     for word in user_controllers:
@@ -83,7 +82,7 @@ def _name_and_location(word: str) -> tuple[str, str]:
 
     Raises
     ------
-    UsageError
+    CommandError
         If `word` does not have one of the `FORMS`, if NAME in lower case is the name of a
         controller in `ROSTER`, or if the file or the top-level package in LOCATION does not
         exist.
@@ -95,14 +94,14 @@ def _name_and_location(word: str) -> tuple[str, str]:
         file = location
     is_module = bool(factory) and MODULE_NAME.fullmatch(module) is not None
     if not name or not (file or is_module):
-        raise UsageError(f"--agent: {word!r} must have the form {FORMS}")
+        raise CommandError(f"--agent: {word!r} must have the form {FORMS}")
     if name.lower() in ROSTER:
-        raise UsageError(f"--agent: {word!r} must have a new name: {name!r} is taken")
+        raise CommandError(f"--agent: {word!r} must have a new name: {name!r} is taken")
     if file and not Path(file).is_file():
-        raise UsageError(f"--agent: {word!r} needs the file {file!r}, which does not exist")
+        raise CommandError(f"--agent: {word!r} needs the file {file!r}, which does not exist")
     package = module.partition(".")[0]
     if not file and importlib.util.find_spec(package) is None:
-        raise UsageError(
+        raise CommandError(
             f"--agent: {word!r} needs the module {package!r}, which is neither in the current "
             "folder nor installed"
         )
@@ -116,7 +115,7 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
 
     Raises
     ------
-    UsageError
+    CommandError
         If a JSON or NPZ file in `locations` cannot be read, if a JSON file is combined with
         another location, or if an NPZ file is combined with a location of another type.
     """
@@ -124,7 +123,7 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
     has_file = ".json" in suffixes or ".npz" in suffixes
     if len(locations) > 1 and has_file and suffixes != {".npz"}:
         listed = " and ".join(locations)
-        raise UsageError(
+        raise CommandError(
             f"--agent: {name!r} must be one gains.json or several .npz files, got {listed}"
         )
     try:
@@ -135,7 +134,7 @@ def _own_spec(name: str, locations: Sequence[str]) -> ControllerSpec:
     except (KeyError, OSError, TypeError, ValueError) as error:
         allowed = "a gains.json of benchmarks.tune or a network of benchmarks.train"
         word = f"{name}={locations[0]}"
-        raise UsageError(f"--agent: {word} must be {allowed}: {error}") from error
+        raise CommandError(f"--agent: {word} must be {allowed}: {error}") from error
     return OwnController(
         name=name,
         label=name,

@@ -20,12 +20,13 @@ from typing import Any
 from agents.controller import PAPER_WINDOWS
 from agents.networks import WINDOWS
 from benchmarks.controllers.spec import ControllerSpec
-from benchmarks.lib.errors import UsageError
-from benchmarks.lib.provenance import CODE_FOLDERS, ROOT
+from benchmarks.lib.command import CommandError
+from benchmarks.lib.outputs import ROOT
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
 from mptc_gym.scoring.policies import start
 
 Factory = Callable[..., Any]
+CODE_FOLDERS = "mptc_gym", "agents", "benchmarks"  # folders with code of this project
 # Optional attributes of a factory, texts for the report: the prior knowledge of the controller,
 # the training of the controller, and a remark.
 TEXTS = "knows", "searched", "note"
@@ -33,7 +34,7 @@ TEXTS = "knows", "searched", "note"
 
 @dataclass(frozen=True, kw_only=True)
 class OwnController(ControllerSpec):
-    """A user's own controller, whose exceptions are reported as a `UsageError`.
+    """A user's own controller, whose exceptions are reported as a `CommandError`.
 
     Attributes
     ----------
@@ -46,7 +47,7 @@ class OwnController(ControllerSpec):
     def members(self) -> list[ControllerSpec]:
         """Load the user's factories, and return a `ControllerSpec` for each factory.
 
-        A `UsageError` is raised if a user's factory cannot be loaded.
+        A `CommandError` is raised if a user's factory cannot be loaded.
         """
         members: list[ControllerSpec] = []
         for location in sorted(set(self.locations)):
@@ -71,7 +72,7 @@ class OwnController(ControllerSpec):
     def make(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller for a batch of `runs` runs, as `ControllerSpec.make` does.
 
-        A `UsageError` is raised if the user's factory cannot be called or raises an error.
+        A `CommandError` is raised if the user's factory cannot be called or raises an error.
         """
         with blame_user(f"{self.name}={self.locations[0]}", "made"):
             return super().make(plant, runs, seed)
@@ -86,7 +87,7 @@ class OwnController(ControllerSpec):
     ) -> Trajectory:
         """Run the controller on a batch of plants, as `ControllerSpec.run` does.
 
-        A `UsageError` is raised if the user's controller raises an error, returns invalid
+        A `CommandError` is raised if the user's controller raises an error, returns invalid
         actions, or does not fit the plants.
         """
         agent = controller or self.make(plant, runs, seed)
@@ -99,9 +100,9 @@ class OwnController(ControllerSpec):
 
 @contextmanager
 def blame_user(controller: str, step: str) -> Iterator[None]:
-    """Turn an exception in the block of a `with` statement into a `UsageError`.
+    """Turn an exception in the block of a `with` statement into a `CommandError`.
 
-    The message of the `UsageError` names the user's controller and ends with a traceback. The
+    The message of the `CommandError` names the user's controller and ends with a traceback. The
     traceback is left out if code of this project has raised a ValueError, for example because
     an action is not finite.
 
@@ -114,7 +115,7 @@ def blame_user(controller: str, step: str) -> Iterator[None]:
     """
     try:
         yield
-    except UsageError:
+    except CommandError:
         raise
     except (Exception, SystemExit) as error:
         reason = f"{type(error).__name__}: {error}\n\n{traceback.format_exc()}"
@@ -122,7 +123,7 @@ def blame_user(controller: str, step: str) -> Iterator[None]:
         is_ours = any(origin.is_relative_to(ROOT / folder) for folder in CODE_FOLDERS)
         if is_ours and isinstance(error, ValueError):
             reason = str(error)
-        raise UsageError(f"--agent: {controller!r} cannot be {step}: {reason}") from error
+        raise CommandError(f"--agent: {controller!r} cannot be {step}: {reason}") from error
 
 
 def load_factory(location: str) -> Factory:

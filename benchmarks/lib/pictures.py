@@ -66,12 +66,13 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         A sentence above the picture, broken into lines of at most `TITLE_CHARACTERS`
         characters.
     """
-    from matplotlib import rc_context  # imported here, as the import is slow
+    from matplotlib import style  # imported here, as the import is slow
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from PIL import Image
 
-    with rc_context(STYLE):
+    # A matplotlibrc of the caller, which may ask for LaTeX, has no influence on the picture.
+    with style.context(["default", STYLE]):
         figure = Figure(figsize=(WIDTH, height))
         sentence = title[0].upper() + title[1:]
         lines = textwrap.wrap(sentence, TITLE_CHARACTERS, break_on_hyphens=False)

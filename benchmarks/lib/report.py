@@ -11,14 +11,13 @@ from typing import Any
 
 import pandas as pd
 
-from benchmarks.lib.storage import write_text
+from benchmarks.lib.command import CommandError
+from benchmarks.lib.outputs import write_text
 
 
 @dataclass(frozen=True)
 class Section:
     """A section of a report.
-
-    All texts of a section are plain text, in which characters such as `*` have no meaning.
 
     Attributes
     ----------
@@ -45,96 +44,68 @@ def write_report(
     folder: Path,
     title: str,
     sections: Sequence[Section],
-    origin: Mapping[str, Any],
-    printed: int | None = None,
+    provenance: Mapping[str, Any],
+    error: CommandError | None = None,
 ) -> None:
-    """Write a report to the file `report.md` in a folder, and print its first sections.
+    """Write a report to the file `report.md` in a folder.
 
     Parameters
     ----------
     folder
-        Folder of the report, which already has the PNG files of the sections. If the file of a
-        picture is missing, the report leaves the picture out.
+        Folder of the report.
     title
-        Heading of the report, as plain text.
+        Heading of the report.
     sections
         Sections of the report, in order.
-    origin
-        Provenance of the results, as `provenance.origin` returns it. If results are missing,
-        `origin["missing"]` is a text that says which results are missing, and the report begins
-        with this text.
-    printed
-        Number of sections to print on the terminal; None prints all sections.
+    provenance
+        Provenance of the results, as `outputs.provenance_of` returns it.
+    error
+        Error that says which results are missing. The report begins with its first line.
     """
-    unfinished = f"Unfinished: {origin['missing']}." if "missing" in origin else ""
     page = [f"# {escape(title)}"]
-    if unfinished:
-        page.append(f"**{escape(unfinished)}**")
-        print(unfinished)
+    if error:
+        first_line, _, _ = str(error).partition("\n")
+        page.append(f"**Unfinished: {escape(first_line)}.**")
     for section in sections:
-        page += _in_markdown(section, folder)
-    page.append(f"{escape(_source(origin))}\n")
+        page += _in_markdown(section)
+    origin = "{started}, commit {commit}: {command}".format_map(provenance)
+    page.append(f"{escape(origin)}\n")
     write_text(folder / "report.md", "\n\n".join(page))
-    for section in sections[:printed]:
-        _print(section)
 
 
-def _in_markdown(section: Section, folder: Path) -> list[str]:
-    """Return a section as blocks of Markdown, such as a heading, a paragraph or a table.
-
-    A picture whose PNG file is not in `folder` is left out of the blocks.
-    """
+def _in_markdown(section: Section) -> list[str]:
+    """Return a section as blocks of Markdown, such as a heading, a paragraph or a table."""
 
     def cell(text: object) -> str:
-        escaped = escape(text)
-        return f"**{escaped}**" if text in section.bold else escaped
+        return f"**{escape(text)}**" if text in section.bold else escape(text)
 
-    blocks = []
+    blocks = [escape(text) for text in section.text]
     if section.title:
-        blocks.append(f"## {escape(section.title)}")
-    blocks += [escape(text) for text in section.text]
+        blocks.insert(0, f"## {escape(section.title)}")
     if section.table is not None:
         cells = section.table.astype(object).map(cell).rename(columns=escape)
         blocks.append(str(cells.to_markdown(index=False, disable_numparse=True)))
-    for name, caption in section.pictures.items():
-        if (folder / name).exists():
-            blocks.append(f"![{escape(caption)}]({name})")
+    blocks += [f"![{escape(text)}]({name})" for name, text in section.pictures.items()]
     return blocks
 
 
 def escape(text: object) -> str:
-    """Return one line of Markdown that a reader sees as the plain text `str(text)`.
+    """Return one line of Markdown for a text in which a user may have chosen a name.
 
-    Users choose the names of controllers, files and columns in a report. Without `escape`, such
-    a name could end a cell of a table, or bring HTML and links into the report.
+    Characters that would end the cell of a table, or begin HTML, are escaped.
     """
-    escaped = " ".join(str(text).split()).replace("\\", "\\\\")
-    escaped = escaped.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    escaped = escaped.replace("|", "\\|").replace("](", "]\\(")
-    for mark in "*_`":  # A single mark has no meaning in Markdown, but a pair of marks has.
-        if escaped.count(mark) > 1:
-            escaped = escaped.replace(mark, f"\\{mark}")
-    return escaped
+    one_line = " ".join(str(text).split())
+    return one_line.replace("<", "&lt;").replace("|", "\\|")
 
 
-def _source(origin: Mapping[str, Any]) -> str:
-    """Return the last line of a report: start time, version of the code, and command."""
-    version = f"code {origin['code'][:12]}"
-    commit = origin["commit"]  # 40 digits, and "-dirty" if files have changed; "" without git
-    if commit:
-        version = f"commit {commit[:12]}{commit[40:]}"
-    command = origin["command"] or "called from Python"
-    return f"{origin['started']}, {version}: {command}"
-
-
-def _print(section: Section) -> None:
-    """Print the heading, the paragraphs and the table of a section on the terminal."""
+def show(*sections: Section) -> None:
+    """Print sections of a report on the terminal."""
     width = shutil.get_terminal_size((150, 24)).columns
-    for text in (section.title, *section.text):
-        if text:
+    for section in sections:
+        for text in filter(None, (section.title, *section.text)):
             print(textwrap.fill(text, width))
-    if section.table is not None:
-        print(on_screen(section.table))
+        if section.table is not None:
+            print(on_screen(section.table))
 
 
 def on_screen(table: pd.DataFrame) -> str:

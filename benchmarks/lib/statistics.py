@@ -88,12 +88,9 @@ def quantile(values: ArrayLike, probability: float) -> Estimate:
     method: Any = "linear" if np.isfinite(ordered).all() else "higher"
     value = np.quantile(ordered, probability, method=method)
     interval = scipy.stats.quantile_test(ordered, p=probability).confidence_interval()
-    low = float(interval.low)
-    if math.isnan(low):
-        low = -math.inf
-    high = float(interval.high)
-    if math.isnan(high):
-        high = math.inf
+    # An end that is unknown, because there are too few values, is NaN.
+    low = -math.inf if math.isnan(interval.low) else float(interval.low)
+    high = math.inf if math.isnan(interval.high) else float(interval.high)
     return Estimate(float(value), low, high, len(ordered))
 
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from benchmarks.lib.command import Parameter, options
-from benchmarks.lib.errors import UsageError
+from benchmarks.lib.command import CommandError, Parameter, options
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant.parameters import slowest_pole
 
@@ -164,7 +163,7 @@ class PlantOptions:
     def arguments(self) -> Arguments:
         """Return the arguments of the environment that --preset, --plant and --set choose.
 
-        A `UsageError` is raised if an argument is unknown or invalid, or if the plant is
+        A `CommandError` is raised if an argument is unknown or invalid, or if the plant is
         unstable.
         """
         arguments: Arguments = {}
@@ -175,7 +174,7 @@ class PlantOptions:
         for text in self.set:
             name, equals, value = text.partition("=")
             if not (name and equals):
-                raise UsageError(
+                raise CommandError(
                     f"--set must be ARGUMENT=VALUE, such as delay=30, got {text!r}"
                 )
             arguments[name] = value  # a bare word, such as random
@@ -190,18 +189,18 @@ class PlantOptions:
                     f"controllers can stabilise such a plant, got {list(a)}"
                 )
         except (TypeError, ValueError) as error:  # A TypeError names an unknown argument.
-            raise UsageError(f"{', '.join(options)}: {error}") from error
+            raise CommandError(f"{', '.join(options)}: {error}") from error
         return arguments
 
 
 def _read_plant(file: Path) -> Arguments:
     """Return the arguments of the environment in a JSON file that `--plant` names.
 
-    A `UsageError` is raised if the file cannot be read, or does not contain a mapping.
+    A `CommandError` is raised if the file cannot be read, or does not contain a mapping.
     """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         return dict(**content)  # a TypeError if `content` is no mapping
     except (OSError, TypeError, ValueError) as error:
         allowed = 'a JSON file of arguments, such as {"delay": 20}'
-        raise UsageError(f"--plant: {file} must be {allowed}: {error}") from error
+        raise CommandError(f"--plant: {file} must be {allowed}: {error}") from error

@@ -3,14 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Annotated
 
 from agents import PolicyNetwork
-from benchmarks.lib.command import Count, Folder, Parameter, command, options
-from benchmarks.lib.errors import UsageError
-from benchmarks.lib.parallel import FanOut
-from benchmarks.lib.results import KeptResults, conditions_of, results_folder
+from benchmarks.lib.command import CommandError, Count, Folder, Parameter, command, options
+from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.outputs import new_folder, provenance_of
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.scenarios import PlantOptions
 
@@ -23,11 +21,12 @@ NETWORKS = "ppo", "ppo-hard"
 class Options:
     """Train policies by PPO on simulated plants.
 
-    After an interruption, the same command with the same code trains only the networks that are
-    still missing.
+    If --out names the folder of an earlier run, only networks that are missing are trained.
     """
 
-    network: Annotated[str, Parameter(choices=NETWORKS)] = field(kw_only=False)
+    network: Annotated[str | None, Parameter(choices=NETWORKS)] = field(
+        default=None, kw_only=False
+    )
     """The kind of network to train."""
     networks: Count = 5
     """The number of networks to train, each from a different seed. All trained networks are
@@ -36,47 +35,49 @@ class Options:
     steps: Count | None = None
     """The length of a training, samples of experience (default: as for the published
     networks)."""
-    out: Folder = Path("results/networks")
+    out: Folder = None
     fan_out: FanOut = field(default_factory=FanOut)
 
 
-def work(options: Options) -> str:
-    """Train and save networks, print the validation results, and return the last line to print.
+def work(options: Options) -> None:
+    """Train and save networks, and print the validation results of all networks in the folder.
 
-    A `UsageError` is raised if the options name a plant for a network other than "ppo".
+    A `CommandError` is raised if the options name no network, or a plant for a network other
+    than "ppo".
     """
     from benchmarks.train import ppo
 
     name = options.network
+    if name is None:
+        raise CommandError(f"name the network to train: {', '.join(NETWORKS)}")
     recipe = ppo.RECIPES[name]
     train = ppo.train
     stem = name  # beginning of the names of the files
     if options.plant.name:
         if name != "ppo":
-            raise UsageError(f"--plant, --preset and --set are for ppo, not for {name}")
+            raise CommandError(f"--plant, --preset and --set are for ppo, not for {name}")
         plant = options.plant.arguments()
         recipe = ppo.for_plant(plant)
         train = partial(train, plant=plant)
         stem = "ppo-plant"
     if options.steps:
         recipe = replace(recipe, steps=options.steps)
-    seeds = range(SEED, SEED + options.networks)
-    tasks = {f"seed {seed}": partial(train, recipe, seed) for seed in seeds}
-    target = options.out / stem
-    with results_folder(target, conditions_of("train", options)) as folder:
-        kept = KeptResults(folder, save_network, PolicyNetwork.load)
-        trained = dict(options.fan_out.stream(tasks, "training", kept))
-        networks = {seed: trained[f"seed {seed}"] for seed in seeds}
-        show_validation(networks)
-        files = {seed: f"{stem}-{seed}" for seed in seeds}
-        for seed, network in networks.items():
-            save_network(folder / f"{files[seed]}.npz", network)
-    return f"Written to {target}: {', '.join(files.values())}"
-
-
-def save_network(path: Path, network: PolicyNetwork) -> None:
-    """Save `network` in the file `path`."""
-    network.save(path)
+    seeds = list(range(SEED, SEED + options.networks))
+    folder = new_folder(options.out, f"train-{stem}", provenance_of(seeds=seeds), goes_on=True)
+    files = {seed: folder / f"{stem}-{seed}.npz" for seed in seeds}
+    tasks = {
+        file.name: partial(train, recipe, seed)
+        for seed, file in files.items()
+        if not file.exists()
+    }
+    finished = options.fan_out.run(
+        tasks, "training", save=lambda name, network: network.save(folder / name)
+    )
+    networks = {seed: PolicyNetwork.load(file) for seed, file in files.items() if file.exists()}
+    show_validation(networks)
+    print(f"The networks are in {folder}/")
+    if finished.error:
+        raise finished.error
 
 
 def show_validation(networks: Mapping[int, PolicyNetwork]) -> None:
@@ -99,4 +100,4 @@ def show_validation(networks: Mapping[int, PolicyNetwork]) -> None:
 main = command("train", Options, work)
 
 if __name__ == "__main__":
-    raise SystemExit(main(None))
+    raise SystemExit(main())

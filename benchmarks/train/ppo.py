@@ -23,7 +23,7 @@ from agents import Increments, PolicyNetwork
 from benchmarks.controllers.plant_scale import scale_of
 from benchmarks.controllers.spec import LIMITS, knowledge
 from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
-from benchmarks.lib.provenance import versions
+from benchmarks.lib.outputs import versions
 from benchmarks.lib.seeds import SEEDS
 from mptc_gym import PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import VALIDATION_SEED
