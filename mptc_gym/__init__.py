@@ -12,7 +12,7 @@ registered environments. `evaluate` scores a policy.
 
 import gymnasium
 
-from mptc_gym.env import MiddlePointEnv
+from mptc_gym.env import EPISODE_STEPS, MiddlePointEnv
 from mptc_gym.evaluation import Evaluation, evaluate
 from mptc_gym.plant.parameters import Parameters
 from mptc_gym.presets import IDS, PRESETS
@@ -33,9 +33,9 @@ __all__ = [
 for _name, _id in IDS.items():
     gymnasium.register(
         id=_id,
-        entry_point="mptc_gym.env:MiddlePointEnv",
-        vector_entry_point="mptc_gym.vector_env:MiddlePointVectorEnv",
-        max_episode_steps=1200,
+        entry_point="mptc_gym.env:make_env",
+        vector_entry_point="mptc_gym.vector_env:make_vector_env",
+        max_episode_steps=EPISODE_STEPS,
         order_enforce=False,  # the environments check this themselves
         kwargs=PRESETS[_name],
     )

@@ -22,6 +22,9 @@ from mptc_gym.plant.parameters import Parameters, full_signature, insert_table
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import ONLY_PLANT, Signals
 
+EPISODE_STEPS = 1200  # samples after which the registered environments truncate an episode
+# The arguments that the `EnvSpec` of a batch has in addition to those of its plants.
+_BATCH_ARGUMENTS = "num_envs", "vectorization_mode", "max_episode_steps", "autoreset_mode"
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys of every info
 _FLOAT32 = np.dtype(np.float32)  # np.fromiter takes a dtype faster than the type np.float32
 NO_RENDER_MODE = (  # a warning of `render`
@@ -64,10 +67,16 @@ class HasJsonSpec:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        """Store a copy of `spec`, with NumPy values converted to lists and Python numbers."""
+        """Store a copy of `spec` that can be written as JSON and that makes this environment.
+
+        `gymnasium.make_vec` stores the time limit of a batch among the arguments alone.
+        """
         if spec is not None:
             spec = copy(spec)
             spec.kwargs = {name: to_python(value) for name, value in spec.kwargs.items()}
+            limit = spec.kwargs.get("max_episode_steps")
+            if limit is not None:
+                spec.max_episode_steps = None if limit == -1 else limit
         self._spec = spec
 
 
@@ -474,6 +483,18 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
 
 
 MiddlePointEnv.__doc__ = insert_table(MiddlePointEnv.__doc__)
+
+
+def make_env(**arguments: Any) -> MiddlePointEnv:
+    """Return one environment; the entry point of `gymnasium.make`.
+
+    `arguments` are the arguments of `MiddlePointEnv`. The `EnvSpec` of a batch, whose arguments
+    include `vectorization_mode`, makes one environment like those in the batch.
+    """
+    if "vectorization_mode" in arguments:
+        for name in _BATCH_ARGUMENTS:
+            arguments.pop(name, None)
+    return MiddlePointEnv(**arguments)
 
 
 def _clip(value: float, limit: float) -> float:

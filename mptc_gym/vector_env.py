@@ -13,7 +13,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from mptc_gym.env import NO_RENDER_MODE, Frame, MiddlePointEnv
+from mptc_gym.env import EPISODE_STEPS, NO_RENDER_MODE, Frame, MiddlePointEnv
 from mptc_gym.environments.batch import BatchEnv, Infos, Mask
 from mptc_gym.environments.record import Record
 from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_python
@@ -325,6 +325,19 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _checked_actions(self, actions: Any) -> Values:
         """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended."""
         return many_actions(actions, self.num_envs, self._ended)
+
+
+def make_vector_env(
+    num_envs: int = 1, *, max_episode_steps: int | None = None, **arguments: Any
+) -> MiddlePointVectorEnv:
+    """Return many environments; the entry point of `gymnasium.make_vec`.
+
+    The arguments are those of `MiddlePointVectorEnv`, but None stands for the registered number
+    of samples of an episode, as in `gymnasium.make`.
+    """
+    if max_episode_steps is None:
+        max_episode_steps = EPISODE_STEPS
+    return MiddlePointVectorEnv(num_envs, max_episode_steps=max_episode_steps, **arguments)
 
 
 class _Window:

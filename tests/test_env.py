@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
@@ -204,6 +205,33 @@ def test_arrays_are_taken_where_lists_are_and_are_lists_in_the_spec(lists):
     for name, value in {"setpoint": np.ones((2, 2)), "delay": np.array([12.0, 24.0])}.items():
         with pytest.raises(ValueError, match=f"{name} must be"):
             MiddlePointEnv(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("given", "samples"), [({}, 1200), ({"max_episode_steps": None}, 1200),
+                           ({"max_episode_steps": 5}, 5), ({"max_episode_steps": -1}, None)],
+)  # fmt: skip
+def test_the_spec_of_a_batch_makes_its_plants_one_by_one_or_together(given, samples):
+    plant = {"delay": np.int64(5), "action": "change", "max_move": np.float32(0.25)}
+    mode = AutoresetMode.SAME_STEP
+    envs = gymnasium.make_vec("MiddlePoint-v0", 2, autoreset_mode=mode, **plant, **given)
+    spec = EnvSpec.from_json(envs.spec.to_json())
+    again, one = gymnasium.make_vec(spec), gymnasium.make(spec)
+    assert (again.num_envs, again.autoreset_mode) == (2, mode)
+    assert again.parameters == one.unwrapped.parameters == envs.parameters
+    assert one.spec.max_episode_steps == samples
+    one.reset(), again.reset()
+    limit = samples or 1300
+    truncations = [
+        (one.step(np.zeros(1))[3], again.step(np.zeros((2, 1)))[3].all()) for _ in range(limit)
+    ]
+    assert truncations[-1] == (samples is not None,) * 2
+    assert not np.any(truncations[:-1])
+
+
+def test_the_size_of_a_batch_is_no_argument_of_one_plant():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'num_envs'"):
+        gymnasium.make("MiddlePoint-v0", num_envs=2)
 
 
 def test_the_longest_delay_and_window_are_taken():

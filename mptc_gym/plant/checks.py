@@ -6,6 +6,7 @@ value in Python's own types, or raises a ValueError that names the argument.
 
 import math
 from collections.abc import Callable, Sequence
+from enum import Enum
 from functools import partial
 from numbers import Integral, Real
 from typing import Any, Final, NoReturn
@@ -126,12 +127,14 @@ def _as_float64(values: Any) -> NDArray[np.float64] | None:
 def to_python(value: Any) -> Any:
     """Return `value` with NumPy arrays and numbers converted to lists and Python numbers.
 
-    The conversion includes NumPy values inside a list or tuple.
+    The conversion includes NumPy values inside a list or tuple, and members of an `Enum`.
     """
     if isinstance(value, list | tuple):
         return type(value)(map(to_python, value))
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
+    if isinstance(value, Enum):
+        return value.value
     return value
 
 
