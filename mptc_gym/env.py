@@ -217,8 +217,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
 
     `render_mode` is None, "human" or "rgb_array"; the section on rendering describes these
     modes. An argument that is a list may also be a tuple or a NumPy array. Every number in an
-    argument must be within +-1e9. The delay and each window of the observation may have at most
-    10,000 samples, and the polynomials `a`, `b` and `c` at most 1,000 coefficients each.
+    argument must be within +-1e9.
 
     ## Info
 
@@ -266,7 +265,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     }
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
-        parameters = Parameters.of_environment(arguments)
+        parameters = Parameters(**arguments)
         one_of("render_mode", render_mode, [None, *self.metadata["render_modes"]])
         self.parameters = parameters
         self.render_mode = render_mode

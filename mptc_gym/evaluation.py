@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from mptc_gym.environments.layers import plant_groups
-from mptc_gym.plant.checks import MOST_PLANTS, count
+from mptc_gym.plant.checks import count
 from mptc_gym.plant.dynamics import action_from_command
 from mptc_gym.plant.parameters import ARGUMENTS, Parameters
 from mptc_gym.presets import IDS, PRESETS
@@ -215,7 +215,7 @@ valve travel 10 t/h; 100 episodes, all alike
     >>> mptc_gym.evaluate(model, model.get_env())
     >>> mptc_gym.evaluate(model, spec_of(model, "MiddlePointHard-v0"))
     """
-    episodes = count("episodes", episodes, 2, MOST_PLANTS)
+    episodes = count("episodes", episodes, 2)
     first = count("seed", seed, 0, 2**63 - 1)
     seeds = range(first, first + episodes)
     with opened(env, episodes, policy, **arguments) as plants:

@@ -41,7 +41,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     Parameters
     ----------
     num_envs
-        Number n of plants, at most 10 million.
+        Number n of plants.
     max_episode_steps
         Number of samples after which an episode is truncated; None or -1 for no limit.
     autoreset_mode
@@ -280,13 +280,6 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _as_array(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return a copy of the array `values`, shape (num_envs,)."""
         return values.copy()
-
-    def _hidden_state(self) -> tuple[dict[str, Values], Values]:
-        """Return the parameter values sampled from ranges, by name, and the loads, degC."""
-        load = self._zeros
-        if self._signals.disturbance is not None:
-            load = self._signals.disturbance.present
-        return self._plants.numbers.select(self.parameters.ranges), load
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Restart the random number streams of the plants in `mask`, each from its own seed.

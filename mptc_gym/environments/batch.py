@@ -19,11 +19,10 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mptc_gym.env import INFO, HasJsonSpec, observation_space
-from mptc_gym.plant.checks import MOST_PLANTS, count, is_count, reject
+from mptc_gym.plant.checks import count, is_count, reject
 from mptc_gym.plant.dynamics import FACTORS
 from mptc_gym.plant.parameters import Parameters
 from mptc_gym.plant.signals import UNLIMITED
-from mptc_gym.plant.state import PlantState, plant_state
 
 Array = Any  # a NumPy array or a PyTorch tensor, depending on the environment
 Infos = dict[str, Any]
@@ -68,8 +67,8 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         arguments: Mapping[str, Any],
     ) -> None:
         """Prepare the plants; the docstring of the class describes the arguments."""
-        self.parameters = Parameters.of_environment(arguments)
-        self.num_envs = count("num_envs", num_envs, 1, MOST_PLANTS)
+        self.parameters = Parameters(**arguments)
+        self.num_envs = count("num_envs", num_envs, 1)
         limit = -1 if max_episode_steps is None else max_episode_steps
         if not is_count(limit, -1) or limit == 0:
             allowed = "an integer of at least 1, or None or -1 for no limit"
@@ -244,31 +243,6 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             infos.setdefault(f"_{name}", flags)
         return infos
 
-    def plant_state(self) -> PlantState:
-        """Return the hidden state of the plants at the present sample.
-
-        Observations do not contain the hidden state, but a critic or a teacher policy may use
-        the hidden state in training. The hidden state belongs to the same sample as the latest
-        observations of `step` or `reset`.
-
-        Returns
-        -------
-        PlantState
-            Delay (samples), dead zone (t/h), gain (degC per t/h), time constant (s) and load
-            (degC), each of shape (num_envs,). The returned gain and time constant include the
-            drift up to the present sample.
-
-        Raises
-        ------
-        ResetNeeded
-            If `plant_state` is called before the first `reset`.
-        """
-        if not self._was_reset:
-            raise ResetNeeded("call reset before plant_state")
-        ages = self._zeros + self._as_array(self._clock - self._starts)
-        numbers, load = self._hidden_state()
-        return plant_state(self.parameters, numbers, ages, load)
-
     def _checked_mask(self, options: Mapping[str, Any]) -> Mask:
         """Return the mask of the plants to reset: `options["reset_mask"]`, or all plants.
 
@@ -293,19 +267,6 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
     @abstractmethod
     def _as_array(self, values: NDArray[Any]) -> Array:
         """Copy a NumPy array, shape (num_envs,), to a new NumPy array or PyTorch tensor."""
-
-    @abstractmethod
-    def _hidden_state(self) -> tuple[dict[str, Array], Array]:
-        """Return the drawn parameter values and the loads of the plants, for `plant_state`.
-
-        Returns
-        -------
-        numbers : dict of array
-            Values that were drawn for arguments that are ranges, by the name of the argument,
-            shape (num_envs,).
-        load : array
-            Load disturbance w of each plant at the present sample, degC, shape (num_envs,).
-        """
 
     @abstractmethod
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:

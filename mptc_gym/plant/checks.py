@@ -17,15 +17,10 @@ from numpy.typing import NDArray
 # Largest magnitude of an argument. Larger numbers would make float32 observations and squared
 # errors meaningless.
 LARGEST_NUMBER: Final[Any] = 10**9
-# The limits of the delay, of the coefficients and of the number of plants are far above what is
-# ever needed. Without these limits, a mistyped number could fill the memory.
-LONGEST_DELAY_OR_WINDOW: Final = 10_000  # samples
-MOST_COEFFICIENTS: Final = 1_000  # of one polynomial of the plant
-MOST_PLANTS: Final = 10_000_000  # in one environment, or in one evaluation
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
 ACTIONS: Final = ("flow", "change")
-_COEFFICIENTS = f"a list of 1 to {MOST_COEFFICIENTS:,} numbers within +-1e9"
+_COEFFICIENTS = "a list of one or more numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # NumPy takes a dtype faster than the type np.float64
 _LONGEST_REPR = 80  # characters of a value in an error message, to keep the message readable
 # The exceptions that NumPy, PyTorch and Python raise for a value that is not a number.
@@ -165,7 +160,7 @@ at_least_1 = partial(number, low=1.0)
 share_of_range = partial(number, low=1e-9, high=2.0)  # in halves of the range
 
 
-def count(name: str, value: Any, minimum: int, maximum: int) -> int:
+def count(name: str, value: Any, minimum: int, maximum: int = LARGEST_NUMBER) -> int:
     """Return the value of an argument as an int.
 
     A ValueError is raised unless `value` is an integer from `minimum` to `maximum`, both
@@ -176,19 +171,17 @@ def count(name: str, value: Any, minimum: int, maximum: int) -> int:
     return int(value)
 
 
-samples = partial(count, minimum=0, maximum=LONGEST_DELAY_OR_WINDOW)
-duration = partial(count, minimum=1, maximum=LARGEST_NUMBER)  # in samples
+samples = partial(count, minimum=0)
+duration = partial(count, minimum=1)  # in samples
 
 
-def numbers(
-    name: str, value: Any, allowed: str = _COEFFICIENTS, most: float = MOST_COEFFICIENTS
-) -> tuple[float, ...]:
-    """Return an argument's value, a list or tuple of 1 to `most` numbers, as a tuple of floats.
+def numbers(name: str, value: Any, allowed: str = _COEFFICIENTS) -> tuple[float, ...]:
+    """Return an argument's value, a list or tuple of numbers, as a tuple of floats.
 
     A ValueError, whose message contains the text `allowed`, is raised unless `value` is a list
-    or tuple of 1 to `most` numbers within +-1e9.
+    or tuple of one or more numbers within +-1e9.
     """
-    if not isinstance(value, list | tuple) or not 0 < len(value) <= most:
+    if not isinstance(value, list | tuple) or not value:
         reject(name, value, allowed)
     for i, element in enumerate(value):
         if not is_number(element):
@@ -227,7 +220,7 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     """
     allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
     if isinstance(value, list | tuple):
-        return numbers(name, value, allowed, most=math.inf)
+        return numbers(name, value, allowed)
     if isinstance(value, str) and value in SETPOINTS:
         return value
     if not is_number(value):

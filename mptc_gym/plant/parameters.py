@@ -4,9 +4,8 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from typing import Any, Final, Generic, TypeVar
@@ -258,30 +257,6 @@ class Parameters(PlantNumbers[Number]):
         if not any(self.windows):
             names = "setpoint_window, error_window, output_window, action_window"
             reject(names, self.windows, "such that the observation has at least one element")
-
-    @classmethod
-    def of_environment(cls, arguments: Mapping[str, Any]) -> Parameters:
-        """Return the `Parameters` for a dict of keyword arguments of an environment.
-
-        Raises
-        ------
-        TypeError
-            If the name of an argument is unknown. The message of the error suggests a similar
-            name of an argument, if possible.
-        ValueError
-            If the value of an argument is not allowed.
-        """
-        for name in arguments:
-            if name == "render_mode":
-                raise TypeError("render_mode is not an argument of the plant")
-            if name not in ARGUMENTS:
-                similar = difflib.get_close_matches(name, [*ARGUMENTS, "render_mode"], n=1)
-                hint = f": did you mean {similar[0]!r}?" if similar else ""
-                # The message begins as Python's own message does, which some callers look for.
-                raise TypeError(
-                    f"MiddlePoint-v0 got an unexpected keyword argument {name!r}{hint}"
-                )
-        return cls(**arguments)
 
     def _check_actuator(self) -> None:
         """Raise a ValueError if the limits of the flow or the dead zone do not fit together.

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper,
 from mptc_gym.environments.layers import is_environment, layers, normaliser_flag, plant_groups
 from mptc_gym.environments.making import make_batch, make_one
 from mptc_gym.evaluation import VALIDATION_SEED, WINDOWS, Evaluation, evaluate
-from mptc_gym.plant.checks import MOST_PLANTS, count, reject
+from mptc_gym.plant.checks import count, reject
 from mptc_gym.sb3.vec_env import make_vec_env
 from mptc_gym.scoring.copies import Copy
 from mptc_gym.scoring.fit import check_fit
@@ -249,7 +249,7 @@ class ScoreCallback(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         self.every = count("every", every, 1, 10**12)
-        self.episodes = count("episodes", episodes, 2, MOST_PLANTS)
+        self.episodes = count("episodes", episodes, 2)
         self.path = None if path is None else _zip_path(path)
         self.scores: list[tuple[int, Evaluation]] = []
         self.best: Evaluation | None = None

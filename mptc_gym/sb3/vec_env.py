@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from mptc_gym.environments.making import make_batch, make_one
-from mptc_gym.plant.checks import MOST_PLANTS, count, reject
+from mptc_gym.plant.checks import count, reject
 from mptc_gym.wrappers import IncrementalAction
 
 
@@ -261,7 +261,7 @@ def make_vec_env(
         If `env` is not an environment of this package, or has wrappers other than
         `IncrementalAction`. If an argument is out of range.
     """
-    n_envs = count("n_envs", n_envs, 1, MOST_PLANTS)
+    n_envs = count("n_envs", n_envs, 1)
     group = count("group", group, 1, n_envs)
     if seed is not None:
         seed = count("seed", seed, 0, 2**63 - 1)

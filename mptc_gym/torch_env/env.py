@@ -350,11 +350,6 @@ class MiddlePointTorchEnv(BatchEnv):
         """Return a NumPy array of shape (num_envs,) as a new tensor on the device."""
         return copy_to_device(values, self.device)
 
-    def _hidden_state(self) -> tuple[dict[str, Any], Tensor]:
-        """Return the drawn parameter values by name, and the loads w, for `plant_state`."""
-        numbers = {name: self._episodes.numbers[name] for name in self.parameters.ranges}
-        return numbers, self._load
-
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Check the seed and the options of a `reset`, and apply both.
 
