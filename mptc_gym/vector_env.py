@@ -13,8 +13,8 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
+from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.env import EPISODE_STEPS, NO_RENDER_MODE, Frame, MiddlePointEnv
-from mptc_gym.environments.batch import BatchEnv, Infos, Mask
 from mptc_gym.environments.record import Record
 from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_python
 from mptc_gym.plant.dynamics import PlantBatch, WantedFlows, action_from_command

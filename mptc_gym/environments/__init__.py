@@ -1,7 +1,6 @@
 """Make, inspect, record and draw environments, with or without wrappers.
 
 - `making` makes environments from environment ids and from Gymnasium's `EnvSpec`.
-- `batch` has the base class of the vector environments in NumPy and PyTorch.
 - `layers` finds the plants and the wrappers in an environment.
 - `record` stores the latest samples of an episode, and `drawing` draws a picture of a record.
 """

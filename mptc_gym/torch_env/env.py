@@ -22,8 +22,8 @@ except ImportError as error:
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.env import MiddlePointEnv
-from mptc_gym.environments.batch import BatchEnv, Infos, Mask
 from mptc_gym.environments.making import make_one
 from mptc_gym.plant.checks import is_count, one_of, reject
 from mptc_gym.plant.dynamics import FACTORS, action_from_command
