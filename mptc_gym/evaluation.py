@@ -7,21 +7,26 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib import resources
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from mptc_gym.environments.layers import plant_groups
 from mptc_gym.plant.checks import count
 from mptc_gym.plant.dynamics import action_from_command
 from mptc_gym.plant.parameters import ARGUMENTS, Parameters
 from mptc_gym.presets import IDS, PRESETS
-from mptc_gym.rollout import Sample, replayed, rollout
-from mptc_gym.scoring.fit import check_fit
-from mptc_gym.scoring.opening import Plants, opened
-from mptc_gym.scoring.policies import start
+from mptc_gym.rollout import (
+    INTERFACE,
+    Plants,
+    Sample,
+    layers,
+    opened,
+    parameters_of,
+    replayed,
+    rollout,
+    start,
+)
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
 Values = NDArray[np.float64]  # one number for each episode, shape (episodes,)
@@ -35,17 +40,9 @@ EPISODES: Final = 100  # episodes of a score, unless the caller asks for another
 VALIDATION_SEED: Final = 5_000_000
 VALIDATION_EPISODES: Final = 200  # validation episodes with a known least possible error
 SAMPLES: Final = 1200  # samples of an episode, unless the environment ends the episode earlier
-WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 # Arguments of an environment that change observations or rewards, but not the least error that
 # a controller can have.
-_ACTION_FORM: Final = "action", "max_move", "compensated_dead_zone"
-_WITHOUT_EFFECT_ON_BOUNDS: Final = (
-    *WINDOWS,
-    *_ACTION_FORM,
-    "reward",
-    "error_scale",
-    "move_weight",
-)
+_WITHOUT_EFFECT_ON_BOUNDS: Final = *INTERFACE, "reward", "error_scale", "move_weight"
 _RESAMPLES: Final = 2000  # number of bootstrap samples for the interval of a score
 
 
@@ -58,8 +55,8 @@ class Evaluation:
     Attributes
     ----------
     env : str
-        Id of the environment, with the names of plant arguments that differ from those of the
-        id, or the class name of an environment that has no id.
+        Id of the preset that is most similar to the plant, with the names of arguments of the
+        plant that differ from those of the preset.
     mean_error, travel : float
         Mean absolute error, degC, and valve travel, t/h, each averaged over the episodes.
     errors : ndarray, shape (episodes,)
@@ -134,15 +131,12 @@ def evaluate(
 ) -> Evaluation:
     """Run a policy on episodes with fixed seeds, and return errors, score and valve travel.
 
-    The environments must have the observation windows (numbers of past values in an
-    observation), the wrappers and the normalisation statistics of the policy's training. The
-    policy acts in copies of the environments that are passed as `env`. A model can be scored in
-    the model's own training environments during the training.
+    The policy acts in new environments, which `evaluate` makes, uses and closes.
 
     Parameters
     ----------
     policy
-        Policy to score, in one of four forms:
+        Policy to score, in one of three forms:
 
         - An object with a method `predict`, such as a model of Stable-Baselines3. `predict`
           receives those of the keywords `state`, `episode_start` and `deterministic=True` that
@@ -151,27 +145,22 @@ def evaluate(
         - An object with a method `act`, such as a controller in `agents`. `act` takes
           observations, shape (n, size), and returns actions, shape (n, 1), in NumPy arrays.
 
-        - A `torch.nn.Module` without the methods `predict` and `act`, or another method of a
-          module, such as `module.forward`. The observations are a tensor of the type of the
-          module's weights. The module is in evaluation mode and computes no gradients.
+        - A function that takes observations, shape (n, size), and returns actions, shape
+          (n, 1), in NumPy arrays. For a PyTorch module, write the function
+          `lambda o: module(torch.as_tensor(o)).detach().numpy()`.
 
-        - Any other function that takes observations, shape (n, size), and returns actions,
-          shape (n, 1), in NumPy arrays.
-
-        A bound method `model.predict` or `controller.act` is treated as the object `model` or
-        `controller`. If the policy has a method `reset`, `evaluate` calls `reset` whenever all
-        environments begin a new episode. `evaluate` does not copy the policy, so a policy that
-        learns while acting keeps what is learnt.
+        If the policy has a method `reset`, `evaluate` calls `reset` whenever all environments
+        begin a new episode.
     env
-        Environment in one of three forms: an id, such as "MiddlePoint-v0", or an `EnvSpec`; a
-        function that returns a new environment; or an existing environment, vector environment
-        of Gymnasium or `VecEnv` of Stable-Baselines3, such as `model.get_env()`. If `env` holds
-        fewer environments than `episodes`, each environment runs several episodes in turn.
+        Environment in one of two forms:
 
-        Environments that cannot be copied, for example environments that run in other processes
-        or show a window, are used directly, and are reset after the evaluation. A copied
-        environment and the original environment share files that are opened by name, global
-        random number generators, and the global and closure variables of functions.
+        - An id, such as "MiddlePoint-v0", or an `EnvSpec`. A Stable-Baselines3 model that has
+          its training environments finds the interface of its training: see
+          `mptc_gym.sb3.like`.
+
+        - A function without arguments that makes a new environment, vector environment of
+          Gymnasium or `VecEnv` of Stable-Baselines3. If the function makes fewer than
+          `episodes` environments at once, each environment runs several episodes in turn.
     episodes
         Number of episodes, at least 2. An episode has 1,200 samples, or fewer if the
         environment ends the episode earlier.
@@ -192,11 +181,10 @@ def evaluate(
     Raises
     ------
     ValueError
-        If `env` does not exist, is no environment of this package, or does not run the episodes
-        that belong to the seeds. If the policy does not fit `env`, or returns actions of the
-        wrong shape. If the policy is a model of Stable-Baselines3 with training environments,
-        and `env` has other observation windows or wrappers. If `env` is the training
-        environment of the policy and cannot be copied.
+        If `env` is an existing environment, is not of this package, or does not run the
+        episodes that belong to the seeds. If the policy does not fit the environment, or
+        returns actions that are not finite or of the wrong shape. If normalisation statistics
+        were never trained.
 
     Examples
     --------
@@ -205,36 +193,29 @@ def evaluate(
     MiddlePoint-v0: mean error 6.613 degC, 7.26 times the least possible; score -0.394; \
 valve travel 10 t/h; 100 episodes, all alike
 
-    A model of Stable-Baselines3 can be scored in its training environments, or in other
-    environments with the same observation windows and wrappers:
+    A model of Stable-Baselines3, on the plants of its training and on others:
 
-    >>> from mptc_gym.sb3 import make_vec_env, spec_of
+    >>> from mptc_gym.sb3 import make_vec_env
     >>> from stable_baselines3 import PPO
     >>> plants = make_vec_env("MiddlePointNoisy-v0", 10, action_window=20)
     >>> model = PPO("MlpPolicy", plants).learn(20_000)
-    >>> mptc_gym.evaluate(model, model.get_env())
-    >>> mptc_gym.evaluate(model, spec_of(model, "MiddlePointHard-v0"))
+    >>> mptc_gym.evaluate(model, "MiddlePointNoisy-v0")
+    >>> mptc_gym.evaluate(model, "MiddlePointHard-v0")
     """
     episodes = count("episodes", episodes, 2)
     first = count("seed", seed, 0, 2**63 - 1)
     seeds = range(first, first + episodes)
-    with opened(env, episodes, policy, **arguments) as plants:
-        check_fit(policy, plants)
-        groups = plant_groups(plants)
-        parameters = groups[0].parameters
+    with opened(policy, env, episodes, arguments) as plants:
+        parameters = parameters_of(plants)
         case = case_of(parameters)
-        if any(case_of(group.parameters) != case for group in groups):
-            raise ValueError(
-                "env must have the same plants in all environments; only observation windows "
-                "and rewards may differ"
-            )
-        # An environment of a user may differ from what its attributes say.
-        is_made_here = isinstance(env, str | EnvSpec) and type(plants) is MiddlePointVectorEnv
-        runs = _run(policy, plants, seeds, parameters, is_replayed=not is_made_here)
+        # A user's code or wrapper may alter the episodes. Environments that are made from an id
+        # without wrappers are one batch, which has no attribute `envs`.
+        is_alterable = callable(env) or any("envs" in vars(layer) for layer in layers(plants))
+        runs = _run(policy, plants, seeds, case, is_replayed=is_alterable)
     bound = find_bound(case, runs.length, seeds)
     notes = [bound.why_not, _why_idle(runs.travels, parameters)]
     evaluation = Evaluation(
-        env=_name_with_changes(groups[0].name, case),
+        env=_name_of(case),
         mean_error=float(runs.errors.mean()),
         travel=float(runs.travels.mean()),
         errors=runs.errors,
@@ -248,49 +229,44 @@ valve travel 10 t/h; 100 episodes, all alike
 
 
 class _Runs(NamedTuple):
-    """Mean errors and valve travels of episodes of equal length."""
+    """Mean errors and valve travels of episodes."""
 
     errors: Values  # mean of |e(k)| of each episode, degC, with e the error of the temperature
     travels: Values  # sum of the changes of the applied flow in each episode, t/h
-    length: int  # number of samples N of each episode
+    length: int  # number of samples N of the shortest episode
 
 
-def _name_with_changes(name: str, case: Parameters) -> str:
-    """Return the name of an environment, with the arguments that differ from those of its id.
-
-    `name` is an id, or the name of a class; `case` has the arguments of the environment.
-    """
-    preset_of_id = {id_of_preset: preset for preset, id_of_preset in IDS.items()}
-    if name not in preset_of_id:
-        return name
-    arguments_of_id = asdict(case_of(Parameters(**PRESETS[preset_of_id[name]])))
-    changed = [key for key, value in asdict(case).items() if value != arguments_of_id[key]]
-    if not changed:
-        return name
-    return f"{name} with another {', '.join(changed)}"
+def _name_of(case: Parameters) -> str:
+    """Return the id of the most similar preset, with the arguments that differ from it."""
+    changes_of = {}
+    for preset, arguments in PRESETS.items():
+        of_preset = vars(case_of(Parameters(**arguments)))
+        changes = [name for name in ARGUMENTS if getattr(case, name) != of_preset[name]]
+        changes_of[IDS[preset]] = changes
+    name, changes = min(changes_of.items(), key=lambda item: len(item[1]))
+    return f"{name} with another {', '.join(changes)}" if changes else name
 
 
 def _run(
-    policy: Any, plants: Plants, seeds: range, parameters: Parameters, *, is_replayed: bool
+    policy: Any, plants: Plants, seeds: range, case: Parameters, *, is_replayed: bool
 ) -> _Runs:
     """Return the mean errors and valve travels of a policy in one episode for each seed.
 
-    If `is_replayed` is true, a second simulation checks the episodes.
+    If `is_replayed` is true, a second simulation of plants with the arguments `case` checks the
+    episodes.
     """
     n = plants.num_envs
     rounds: list[_Runs] = []
     for first in seeds[::n]:
-        seeds_of_round = [*range(first, first + n)]
+        seeds_of_round = range(first, first + n)
         samples = rollout(plants, start(policy, n), SAMPLES, seeds_of_round)
         if is_replayed:
-            samples = replayed(samples, parameters, seeds_of_round)
+            samples = replayed(samples, case, seeds_of_round)
         rounds.append(_measure(samples, n))
-        if rounds[-1].length != rounds[0].length:
-            _refuse_lengths(rounds[-1].length)
     # The plants run at the same time, so there may be more episodes than seeds.
     errors = np.hstack([runs.errors for runs in rounds])[: len(seeds)]
     travels = np.hstack([runs.travels for runs in rounds])[: len(seeds)]
-    return _Runs(errors, travels, rounds[0].length)
+    return _Runs(errors, travels, min(runs.length for runs in rounds))
 
 
 def _measure(samples: Iterator[Sample], n: int) -> _Runs:
@@ -305,18 +281,9 @@ def _measure(samples: Iterator[Sample], n: int) -> _Runs:
         total_errors += np.abs(sample.infos["error"])
         travels += np.abs(sample.infos["applied"] - applied)
         applied = sample.infos["applied"]
-        if sample.ended.any():
-            if not sample.ended.all():
-                _refuse_lengths(length)
+        if sample.ended.all():
             break
     return _Runs(total_errors / length, travels, length)
-
-
-def _refuse_lengths(length: int) -> NoReturn:
-    """Raise a ValueError: one episode has ended after `length` samples, others have not."""
-    raise ValueError(
-        f"env must end all episodes at once, got an episode of {length} samples among others"
-    )
 
 
 def _why_idle(travels: Values, parameters: Parameters) -> str:
@@ -328,8 +295,9 @@ def _why_idle(travels: Values, parameters: Parameters) -> str:
         return "the valve never moved"
     zone = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     return (
-        f"no action left the dead zone of {zone} t/h: train in mptc_gym.wrappers."
-        "IncrementalAction with compensate_dead_zone=True, or choose larger actions"
+        f"no action left the dead zone of {zone} t/h: score the policy in the interface of its "
+        "training, train it in mptc_gym.wrappers.IncrementalAction with "
+        "compensate_dead_zone=True, or choose larger actions"
     )
 
 

@@ -1,25 +1,36 @@
-"""Run a policy in a vector environment, and check that the episodes belong to their seeds."""
+"""Run a policy in new environments, and check that the episodes belong to their seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any, Final, NamedTuple
 
+import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
 from mptc_gym.plant.checks import reject, shorten
 from mptc_gym.plant.dynamics import action_from_command
 from mptc_gym.plant.parameters import Parameters
-from mptc_gym.scoring.policies import Act
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
+WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
+# The arguments of an environment that say what a policy observes and what its actions mean.
+INTERFACE: Final = *WINDOWS, "action", "max_move", "compensated_dead_zone"
 # Largest difference between an info and the expected info, divided by (1 + |expected info|):
 # far more than rounding errors, and far less than the effect of another plant or seed.
 _TOLERANCE: Final = 1e-6
 
+Act = Callable[[Any], Any]  # from observations to actions, both with a row for each plant
 Infos = Mapping[str, Any]  # infos of n plants by name, in arrays of shape (n,)
+# A vector environment of Gymnasium. The annotation is not `VectorEnv`, because the annotated
+# method `VectorEnv.reset` takes no list of seeds.
+Plants = Any
 
 
 class Sample(NamedTuple):
@@ -32,93 +43,320 @@ class Sample(NamedTuple):
     ended: NDArray[np.bool_]  # whether this sample is the last of an episode, shape (n,)
 
 
-def rollout(env: Any, act: Act, samples: int, seeds: list[int]) -> Iterator[Sample]:
+def rollout(plants: Plants, act: Act, samples: int, seeds: Sequence[int]) -> Iterator[Sample]:
     """Yield the samples of n plants that a policy controls, beginning with a reset.
 
-    `env` is a vector environment of Gymnasium with a plant for each seed. The samples k = 0, 1,
-    ..., N are yielded, where N is the argument `samples`. A ValueError is raised if `env` does
-    not allow a reset, or if the policy returns actions that are not finite or do not have the
-    shape of the action space.
+    Parameters
+    ----------
+    plants
+        Vector environment of Gymnasium with a plant for each seed.
+    act
+        Function from observations to actions, as `start` returns.
+    samples
+        Number N of steps; the samples k = 0, 1, ..., N are yielded.
+    seeds
+        Seed of each plant's episode.
+
+    Raises
+    ------
+    ValueError
+        If actions are not finite, or do not have the shape of the action space.
     """
-    try:
-        observations, infos = env.reset(seed=seeds)
-    except RuntimeError as error:  # from a Monitor that does not allow early resets
-        raise ValueError(f"env must allow a reset in mid-episode: {error}") from error
-    yield Sample(observations, _copied(infos_in_arrays(infos)), np.zeros(len(seeds), np.bool_))
-    shape = (len(seeds), *env.single_action_space.shape)
+    observations, infos = plants.reset(seed=[*seeds])
+    yield Sample(observations, infos, np.zeros(len(seeds), np.bool_))
+    shape = (len(seeds), *plants.single_action_space.shape)
     for _ in range(samples):
         actions = _checked_actions(act(observations), shape)
-        observations, _, terminated, truncated, infos = env.step(actions)
-        arrays = infos_in_arrays(infos)
+        observations, _, terminated, truncated, infos = plants.step(actions)
         # At the end of an episode, some environments return the infos of the next episode, and
         # put the infos of the last sample into "final_info".
-        infos_of_sample = _copied(arrays.get("final_info", arrays))
-        yield Sample(observations, infos_of_sample, terminated | truncated)
-
-
-def infos_in_arrays(infos: Any) -> Infos:
-    """Return the infos of n plants as a dict from names to arrays of shape (n,).
-
-    A dict `infos` is returned unchanged. A list `infos` holds a dict for each plant; only names
-    that have a number in the first dict are kept, and a number that a plant lacks becomes NaN.
-    """
-    if isinstance(infos, Mapping):
-        return infos
-    names = [name for name, value in infos[0].items() if isinstance(value, int | float)]
-    return {name: np.array([info.get(name, np.nan) for info in infos]) for name in names}
-
-
-def _copied(infos: Infos) -> Infos:
-    """Return infos as a new dict of new arrays, without the masks under names such as "_error".
-
-    A wrapper may write the infos of the next sample into the arrays of this sample.
-    """
-    return {name: np.array(infos[name]) for name in infos if not name.startswith("_")}
+        yield Sample(observations, infos.get("final_info", infos), terminated | truncated)
 
 
 def _checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return the actions of a policy as an array, after a check of shape and values.
-
-    A ValueError is raised if the actions are not finite numbers in an array of shape `shape`.
-    """
+    """Return actions as an array; ValueError unless they are finite, and of shape `shape`."""
     if isinstance(actions, tuple):
-        allowed = (
-            "a function that returns actions alone, such as lambda o: agent.get_action(o)[0], "
-            "or with tensors lambda o: agent.get_action(torch.as_tensor(o))[0].numpy()"
+        reject("policy", actions, "a function of actions alone, such as lambda o: policy(o)[0]")
+    array = np.asarray(actions)
+    if array.shape == shape and np.isfinite(array).all():
+        return array
+    advice = ""
+    if array.shape == shape[:1]:
+        advice = ": return actions[:, None]"
+    elif array.shape != shape:
+        advice = (
+            ": observations have a row for each plant, such as observations[:, 3:4]; a policy "
+            "of one observation is lambda o: numpy.stack([policy(row) for row in o])"
         )
-        reject("policy", actions, allowed)
+    raise ValueError(
+        f"policy must return finite actions, shape {shape}, got {shorten(actions)}, shape "
+        f"{array.shape}{advice}"
+    )
+
+
+def start(policy: Any, n: int) -> Act:
+    """Reset a policy, and return a function that acts in one episode of n plants.
+
+    A policy is an object with a method `predict` or `act`, or a function of NumPy arrays. If
+    the policy has a method `reset`, `start` calls `reset`. A ValueError is raised if `policy`
+    has none of these forms.
+    """
+    if hasattr(policy, "predict"):
+        act = _act_by_predict(policy.predict, n)
+    elif hasattr(policy, "act"):
+        act = policy.act
+    elif hasattr(policy, "forward"):  # a torch.nn.Module
+        written = "lambda o: module(torch.as_tensor(o)).detach().numpy()"
+        reject("policy", policy, f"a function of NumPy arrays, such as {written}")
+    elif callable(policy):
+        act = policy
+    else:
+        reject("policy", policy, "a function, or an object with predict or act")
+    if hasattr(policy, "reset"):
+        policy.reset()
+    return act
+
+
+def _act_by_predict(predict: Callable[..., Any], n: int) -> Act:
+    """Return a function from observations to actions that calls the method `predict`.
+
+    The state that `predict` returns, such as that of a recurrent network, is passed to the next
+    call. Of the keywords of Stable-Baselines3, `predict` receives those that it takes.
+    """
+    accepted = inspect.signature(predict).parameters.values()
+    takes_any = any(argument.kind is argument.VAR_KEYWORD for argument in accepted)
+    names = {argument.name for argument in accepted}
+    keywords = {"state": None, "episode_start": np.ones(n, np.bool_), "deterministic": True}
+    keywords = {name: keywords[name] for name in keywords if takes_any or name in names}
+
+    def act(observations: Any) -> Any:
+        """Return the actions from `predict`, and keep the returned state for the next call."""
+        returned = predict(observations, **keywords)
+        if "episode_start" in keywords:
+            keywords["episode_start"] = np.zeros(n, np.bool_)
+        if not isinstance(returned, tuple):
+            return returned
+        actions, state = returned
+        if "state" in keywords:
+            keywords["state"] = state
+        return actions
+
+    return act
+
+
+@contextmanager
+def opened(policy: Any, env: Any, n: int, arguments: Mapping[str, Any]) -> Iterator[Plants]:
+    """Make environments in which a policy can act, for a `with` statement that closes them.
+
+    Parameters
+    ----------
+    policy
+        Policy in one of the forms that `start` takes.
+    env
+        Id, `EnvSpec`, or function that makes a new environment, as in `mptc_gym.evaluate`.
+    n
+        Number of plants, unless `env` is a function that makes many.
+    arguments
+        Arguments of the environment, by name.
+
+    Yields
+    ------
+    VectorEnv
+        Vector environment, in which no wrapper updates normalisation statistics.
+
+    Raises
+    ------
+    ValueError
+        If `env` is an existing environment, or is not of this package, or does not fit the
+        policy.
+    """
+    plants = _make_plants(policy, env, n, arguments)
     try:
-        checked = np.asarray(actions)  # `asarray` drops the mask of a masked array
-        is_masked = np.ma.is_masked(actions)
-        if checked.shape == shape and np.isfinite(checked).all() and not is_masked:
-            return checked
-        received = f"{shorten(actions)}, shape {checked.shape}"
-    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: from tensors
-        received = f"{shorten(actions)} ({error})"
-    raise ValueError(f"policy must return finite actions, shape {shape}, got {received}")
+        _freeze_statistics(plants)
+        _check_fit(policy, plants, is_made_by_user=callable(env))
+        yield plants
+    finally:
+        plants.close()
+
+
+def _make_plants(policy: Any, env: Any, n: int, arguments: Mapping[str, Any]) -> Plants:
+    """Return a new vector environment; the docstring of `opened` describes the arguments."""
+    if isinstance(env, str | EnvSpec):
+        if training_of(policy) is not None:
+            from mptc_gym.sb3 import like  # which needs Stable-Baselines3
+
+            return _FromVecEnv(like(policy, env, n, **arguments))
+        if isinstance(env, EnvSpec) and env.additional_wrappers:
+            return gymnasium.make_vec(
+                env, n, vectorization_mode="sync", disable_env_checker=True, **arguments
+            )
+        return gymnasium.make_vec(env, n, **arguments)
+    if not callable(env):
+        allowed = (
+            "an id, an EnvSpec or a function that makes a new environment, such as lambda: ... "
+            "(for a Stable-Baselines3 model with its environments, leave env out)"
+        )
+        reject("env", env, allowed)
+    if arguments:
+        raise ValueError(f"{', '.join(arguments)} must be given where env is made, in env")
+    first, second = env(), env()
+    if first.unwrapped is second.unwrapped:
+        reject("env", first, "a function that makes a new environment at each call")
+    if isinstance(first, gymnasium.Env):
+        makers = [lambda: first, lambda: second, *[env] * (n - 2)]
+        return SyncVectorEnv(makers[:n])
+    second.close()
+    return first if isinstance(first, VectorEnv) else _FromVecEnv(first)
+
+
+class _FromVecEnv(VectorEnv[Any, Any, Any]):
+    """A vector environment of Gymnasium that wraps a `VecEnv` of Stable-Baselines3."""
+
+    def __init__(self, venv: Any) -> None:
+        self.venv = venv
+        self.num_envs = venv.num_envs
+        self.single_observation_space = venv.observation_space
+        self.single_action_space = venv.action_space
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Reset all plants with successive seeds, of which the list `seed` has the first."""
+        self.venv.seed(seed[0])
+        observations = self.venv.reset()
+        return observations, _in_arrays(self.venv.unwrapped.reset_infos)
+
+    def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step all plants; each episode that has ended counts as terminated."""
+        observations, rewards, ended, infos = self.venv.step(actions)
+        # A `GymnasiumVecEnv` fills its list of infos only where episodes end, and has the infos
+        # of all plants in its attribute `infos`.
+        arrays = _in_arrays(infos) or self.venv.unwrapped.infos
+        return observations, rewards, ended, np.zeros_like(ended), arrays
+
+    def get_attr(self, name: str) -> Any:
+        """Return the value of an attribute for each plant."""
+        return self.venv.get_attr(name)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the `VecEnv`."""
+        self.venv.close()
+
+
+def _in_arrays(infos: Sequence[Infos]) -> dict[str, Any]:
+    """Return the numbers in the infos of n plants, by name, in arrays of shape (n,)."""
+    names = [name for name, value in infos[0].items() if isinstance(value, int | float)]
+    return {name: np.array([info[name] for info in infos]) for name in names}
+
+
+def layers(env: Any) -> Iterator[Any]:
+    """Yield `env` and all wrappers and environments within `env` that are in this process."""
+    yield env
+    attributes = vars(env)
+    inner = [attributes.get("venv"), attributes.get("env"), *attributes.get("envs", ())]
+    for layer in inner:
+        if layer is not None:
+            yield from layers(layer)
+
+
+def _freeze_statistics(plants: Plants) -> None:
+    """Stop all updates of normalisation statistics in new environments.
+
+    A ValueError is raised if statistics were never updated, or are in worker processes.
+    """
+    for layer in layers(plants):
+        if "processes" in vars(layer):
+            ask = getattr(layer, "env_method", None) or layer.call
+            if any(ask("has_wrapper_attr", "update_running_mean")):
+                raise ValueError(
+                    "env must not normalise in worker processes, where the statistics go on "
+                    "changing: use DummyVecEnv or SyncVectorEnv"
+                )
+        if hasattr(type(layer), "update_running_mean"):  # a wrapper of Gymnasium
+            layer.update_running_mean = False
+        if "norm_obs" in vars(layer):  # a VecNormalize
+            layer.training = False
+        statistics = vars(layer).get("obs_rms", {})
+        parts = statistics.values() if isinstance(statistics, dict) else [statistics]
+        if any(part.count < 1.0 for part in parts):
+            raise ValueError(
+                f"env must have the statistics of the policy's training in "
+                f"{type(layer).__name__}, got initial ones: write VecNormalize.load(path, env)"
+            )
+
+
+def _check_fit(policy: Any, plants: Plants, *, is_made_by_user: bool) -> None:
+    """Raise a ValueError if a controller or a model was made for other environments."""
+    parameters = parameters_of(plants)
+    if hasattr(policy, "check_environment"):
+        policy.check_environment(parameters, "", plants.num_envs)
+    training = training_of(policy)
+    if training is not None and is_made_by_user:
+        expected, received = _interface(training), _interface(plants)
+        differing = [name for name in expected if expected[name] != received[name]]
+        if differing:
+            raise ValueError(
+                f"env must have the interface of the policy's training, "
+                f"{', '.join(f'{name}={expected[name]}' for name in differing)}, got "
+                f"{', '.join(f'{name}={received[name]}' for name in differing)}"
+            )
+    if hasattr(policy, "get_env"):
+        expected_spaces = policy.observation_space, policy.action_space
+        spaces = plants.single_observation_space, plants.single_action_space
+        if spaces != expected_spaces:
+            raise ValueError(
+                f"env must have the spaces of the policy's training, "
+                f"{shorten(expected_spaces)}, got {shorten(spaces)}: load the model with its "
+                "environments, PPO.load(path, env=...)"
+            )
+
+
+def training_of(policy: Any) -> Any:
+    """Return the training environments of a Stable-Baselines3 model; None if it has none."""
+    return policy.get_env() if hasattr(policy, "get_env") else None
+
+
+def _interface(env: Any) -> dict[str, Any]:
+    """Return what a policy must find as in its training, by name."""
+    parameters = parameters_of(env)
+    interface = {name: getattr(parameters, name) for name in INTERFACE}
+    interface["normalised"] = any("obs_rms" in vars(layer) for layer in layers(env))
+    return interface
+
+
+def parameters_of(env: Any) -> Parameters:
+    """Return the arguments of the first plant in a vector environment or a `VecEnv`.
+
+    A ValueError is raised if `env` is not of this package, or is in PyTorch.
+    """
+    if isinstance(env.unwrapped, MiddlePointVectorEnv):
+        return env.unwrapped.parameters
+    try:
+        parameters = env.get_attr("parameters")[0]
+    except AttributeError:
+        parameters = None
+    if not isinstance(parameters, Parameters):
+        reject("env", env, "of mptc_gym and in NumPy, such as an id or a spec of it")
+    return parameters
 
 
 def replayed(
-    samples: Iterator[Sample], parameters: Parameters, seeds: list[int]
+    samples: Iterator[Sample], parameters: Parameters, seeds: Sequence[int]
 ) -> Iterator[Sample]:
     """Yield the samples of a rollout, and compare each sample with a second simulation.
 
     The second simulation is a `MiddlePointVectorEnv` with the arguments, the seeds and the
-    commands of the rollout. A ValueError is raised if infos of the rollout differ from infos of
-    the second simulation: the environment of the rollout then has changed the seed, skipped
-    samples, or changed the plant or the infos.
+    commanded flows of the rollout. A ValueError is raised if infos of the rollout differ from
+    infos of the second simulation: the environment of the rollout then has changed the seed,
+    skipped samples, or changed the plant or the infos.
     """
     plants = MiddlePointVectorEnv(len(seeds), **(asdict(parameters) | {"action": "flow"}))
-    _, expected = plants.reset(seed=seeds)
+    limits = parameters.u_min, parameters.u_max
+    _, expected = plants.reset(seed=[*seeds])
     for k, sample in enumerate(samples):
         if k > 0:
             commands = np.asarray(sample.infos.get("command", np.zeros(len(seeds))))
-            actions = action_from_command(commands, parameters.u_min, parameters.u_max)[
-                :, np.newaxis
-            ]
-            expected = plants.step(actions)[-1]
-        if k > 0 or sample.infos:  # some environments return no infos at a reset
-            _compare_infos(sample.infos, expected, k)
+            actions = action_from_command(commands, *limits)
+            expected = plants.step(np.reshape(actions, (-1, 1)))[-1]
+        _compare_infos(sample.infos, expected, k)
         yield sample
 
 
@@ -133,5 +371,6 @@ def _compare_infos(infos: Infos, expected: Infos, k: int) -> None:
             raise ValueError(
                 f"env must run the episodes of its seeds, whose {name} at sample {k} is "
                 f"{shorten(expected[name])}, got {shorten(infos.get(name))}: env must not "
-                "reset with another seed, skip or repeat samples, or change the plant or infos"
+                "reset with another seed, skip or repeat samples, end an episode early, or "
+                "change the plant or the infos"
             )

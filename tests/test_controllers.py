@@ -140,7 +140,7 @@ class TestOwnControllers:
         [
             ("def Mine(:", "--agent: .* cannot be loaded: SyntaxError"),
             ("raise SystemExit(3)", "--agent: .* cannot be loaded: SystemExit: 3"),
-            ("class Mine: pass", "policy must be a function, .*, or an object with pre"),
+            ("class Mine: pass", "policy must be a function, or an object with pre"),
             ("class Mine: observation = 3", "cannot be loaded: .* a dict .* got 3"),
             ("class Mine: observation = {'delay': 0}", "with keys from .* got {'delay': 0}"),
             (

@@ -95,7 +95,7 @@ class TestEvaluate:
     def test_a_score_without_travel_says_why(self):
         result = evaluate(idle, "MiddlePointRandomised-v0", episodes=2)
         assert result.score == 0.0
-        assert "no action left the dead zone of 3 to 7 t/h: train in mptc_gym.wr" in str(result)
+        assert "no action left the dead zone of 3 to 7 t/h: score the policy in" in str(result)
         assert "dead zone of 5 t/h" in str(evaluate(idle, episodes=2))
         assert "the valve never moved" in evaluate(idle, episodes=2, dead_zone=0.0).note
         assert not evaluate(PIController(), episodes=2).note

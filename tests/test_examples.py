@@ -14,7 +14,6 @@ from stable_baselines3 import PPO
 import mptc_gym.sb3
 from benchmarks.examples import recurrent
 from mptc_gym import evaluate
-from mptc_gym.sb3 import load, spec_of
 from tests.conftest import ROOT
 
 
@@ -47,8 +46,10 @@ def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):
     runpy.run_path(str(ROOT / "benchmarks/examples/sb3.py"), run_name="__main__")
     printed = capsys.readouterr().out
     line = re.search(r"MiddlePointNoisy-v0: mean error ([\d.]+)", printed)
-    model = load(tmp_path / "ppo-3.zip", device="cpu")
-    noisy = evaluate(model, spec_of(model, "MiddlePointNoisy-v0"))
+    namespace = runpy.run_path(str(ROOT / "benchmarks/examples/sb3.py"))
+    plants = mptc_gym.sb3.make_vec_env("MiddlePoint-v0", 8, **namespace["PLANTS"])
+    model = PPO.load(tmp_path / "ppo-3.zip", env=plants, device="cpu")
+    noisy = evaluate(model, "MiddlePointNoisy-v0")
     assert f"{noisy.mean_error:.3f}" == line[1]
 
 

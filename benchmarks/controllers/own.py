@@ -23,7 +23,7 @@ from benchmarks.controllers.spec import ControllerSpec
 from benchmarks.lib.command import CommandError
 from benchmarks.lib.outputs import ROOT
 from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
-from mptc_gym.scoring.policies import start
+from mptc_gym.rollout import start
 
 Factory = Callable[..., Any]
 CODE_FOLDERS = "mptc_gym", "agents", "benchmarks"  # folders with code of this project

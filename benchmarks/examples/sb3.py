@@ -37,7 +37,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
 from mptc_gym import evaluate
-from mptc_gym.sb3 import make_vec_env, save, spec_of
+from mptc_gym.sb3 import make_vec_env
 
 GROUP = 8  # number of plants that have the same noise and set points
 # Arguments of the class `PPO`.
@@ -185,9 +185,9 @@ def main() -> None:
     model = make_ppo(plants, options.seed, features_extractor_class=Changes, net_arch=layers)
     # The standard deviation of the actions falls from exp(-1.2) to exp(-4.0).
     model.learn(options.steps, Exploration(first=-1.2, last=-4.0))
-    save(model, options.out / f"ppo-{options.seed}.zip")
+    model.save(options.out / f"ppo-{options.seed}.zip")
     for env in ("MiddlePoint-v0", "MiddlePointNoisy-v0"):
-        print(evaluate(model, spec_of(model, env)))
+        print(evaluate(model, env))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn, cast
 
+import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from mptc_gym.environments.making import make_batch, make_one
+from mptc_gym.environments.making import make_batch
 from mptc_gym.plant.checks import count, reject
 from mptc_gym.wrappers import IncrementalAction
 
@@ -171,7 +172,9 @@ class GymnasiumVecEnv(VecEnv):
         """
         values: list[Any] = []
         for batch in self.batches:
-            value = self.spec if attr_name == "spec" else getattr(batch, attr_name)
+            value = self.spec
+            if attr_name != "spec":
+                value = getattr(batch.unwrapped, attr_name)
             values += [value] * batch.num_envs
         return [values[index] for index in self._get_indices(indices)]
 
@@ -266,7 +269,7 @@ def make_vec_env(
     if seed is not None:
         seed = count("seed", seed, 0, 2**63 - 1)
     render_mode = arguments.pop("render_mode", None)  # for the batch, but not for its spec
-    single = make_one(env, arguments)
+    single = gymnasium.make(env, disable_env_checker=True, **arguments)
     if isinstance(wrapper, Mapping):
         unknown = set(wrapper) - set(inspect.signature(IncrementalAction).parameters)
         if unknown:

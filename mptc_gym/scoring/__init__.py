@@ -1,1 +1,0 @@
-"""Hold the modules that `mptc_gym.evaluate` uses to run a policy in environments."""
