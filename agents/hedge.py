@@ -27,13 +27,14 @@ class RandomSetpoint:
 
     The set point is piecewise constant. The values of the set point are independent and
     uniformly distributed. The number of samples between two changes is uniformly distributed.
+    Each field of `RandomSetpoint` is an array of shape (n,), or one number for all loops.
     """
 
-    shortest: float
+    shortest: Array | float
     """Least number of samples between two changes of the set point."""
-    longest: float
+    longest: Array | float
     """Greatest number of samples between two changes of the set point."""
-    amplitude: float
+    amplitude: Array | float
     """Greatest value of the set point, in any unit of temperature; the least value is
     `-amplitude`."""
 
