@@ -1,4 +1,4 @@
-"""Define the base classes of all controllers, and validate constructor arguments."""
+"""Define the base classes of all controllers, and check constructor arguments."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from numbers import Integral, Real
-from typing import Annotated, Any, Final, get_type_hints
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,96 +18,63 @@ from agents.actuator import float32_action
 # three errors: the six inputs of the paper's network.
 PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
-# Largest allowed number of network nodes, of loops and of samples of delay. A larger number is
-# probably a typing error, and could exhaust the memory.
-LARGEST_SIZE = 1_000_000
-
-Validator = Callable[[str, Any], Any]
 
 
-def _require(is_allowed: bool, name: str, value: Any, allowed: str) -> None:
-    """Raise a ValueError for the argument `name` unless `is_allowed` is true.
-
-    `allowed` describes the allowed values in words for the message, such as "a finite number".
-    """
-    if not is_allowed:
-        raise ValueError(f"{name} must be {allowed}, got {value!r}")
-
-
-def _is_number(value: Any, kind: type[Any]) -> bool:
-    """Return whether `value` has the type `kind` (`Real` or `Integral`) and is not a bool."""
-    return isinstance(value, kind) and not isinstance(value, bool | np.bool_)
-
-
-# Each of the following functions validates a constructor argument. `name` is the argument's
-# name for the message of the ValueError.
+# Each of the following functions returns the value of a constructor argument, or raises a
+# ValueError with the argument's name, the value and what is allowed.
 
 
 def finite(name: str, value: Any) -> float:
-    """Return `value` as a float; raise a ValueError unless it is a finite number."""
-    is_allowed = _is_number(value, Real) and math.isfinite(value)
-    _require(is_allowed, name, value, "a finite number")
-    return float(value)
+    """Return a finite number as a float."""
+    return _real(name, value, "a finite number", lambda number: True)
 
 
 def not_negative(name: str, value: Any) -> float:
-    """Return `value` as a float; raise a ValueError unless it is finite and at least 0."""
-    is_allowed = _is_number(value, Real) and 0.0 <= value < math.inf
-    _require(is_allowed, name, value, "a finite number of at least 0")
-    return float(value)
+    """Return a finite number of at least 0 as a float."""
+    return _real(name, value, "a finite number of at least 0", lambda number: number >= 0.0)
 
 
 def positive(name: str, value: Any) -> float:
-    """Return `value` as a float; raise a ValueError unless it is finite and above 0."""
-    is_allowed = _is_number(value, Real) and 0.0 < value < math.inf
-    _require(is_allowed, name, value, "a finite number above 0")
-    return float(value)
+    """Return a finite number above 0 as a float."""
+    return _real(name, value, "a finite number above 0", lambda number: number > 0.0)
 
 
 def nonzero(name: str, value: Any) -> float:
-    """Return `value` as a float; raise a ValueError unless it is finite and not 0."""
-    is_allowed = _is_number(value, Real) and 0.0 < abs(value) < math.inf
-    _require(is_allowed, name, value, "a finite number other than 0")
+    """Return a finite number other than 0 as a float."""
+    return _real(name, value, "a finite number other than 0", lambda number: number != 0.0)
+
+
+def _real(name: str, value: Any, allowed: str, is_allowed: Callable[[float], bool]) -> float:
+    """Return `value` as a float, if it is a finite number for which `is_allowed` is true."""
+    is_number = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+    if not (is_number and math.isfinite(value) and is_allowed(value)):
+        raise ValueError(f"{name} must be {allowed}, got {value!r}")
     return float(value)
 
 
+def from_0(name: str, value: Any) -> int:
+    """Return an integer of at least 0 as an int."""
+    return _integer(name, value, least=0)
+
+
+def from_1(name: str, value: Any) -> int:
+    """Return an integer of at least 1 as an int."""
+    return _integer(name, value, least=1)
+
+
+def _integer(name: str, value: Any, least: int) -> int:
+    """Return `value` as an int, if it is an integer of at least `least`."""
+    is_integer = isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
+    if not (is_integer and value >= least):
+        raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+    return int(value)
+
+
 def flag(name: str, value: Any) -> bool:
-    """Return `value` as a bool; raise a ValueError unless it is True or False."""
-    _require(isinstance(value, bool | np.bool_), name, value, "True or False")
+    """Return True or False as a bool."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
     return bool(value)
-
-
-def integer_from_0(name: str, value: Any) -> int:
-    """Return `value` as an int; raise a ValueError unless it is an integer of at least 0."""
-    is_allowed = _is_number(value, Integral) and value >= 0
-    _require(is_allowed, name, value, "an integer of at least 0")
-    return int(value)
-
-
-def integer_from_1(name: str, value: Any) -> int:
-    """Return `value` as an int; raise a ValueError unless it is an integer of at least 1."""
-    is_allowed = _is_number(value, Integral) and value >= 1
-    _require(is_allowed, name, value, "an integer of at least 1")
-    return int(value)
-
-
-def array_size(name: str, value: Any) -> int:
-    """Return `value` as an int; raise a ValueError unless it is from 1 to `LARGEST_SIZE`."""
-    is_allowed = _is_number(value, Integral) and 1 <= value <= LARGEST_SIZE
-    _require(is_allowed, name, value, f"an integer from 1 to {LARGEST_SIZE:,}")
-    return int(value)
-
-
-# Types for the fields of controllers. Each type carries a validator, which the constructor of
-# the controller calls with the field's value.
-Number = Annotated[float, finite]
-NotNegative = Annotated[float, not_negative]
-Positive = Annotated[float, positive]
-Gain = Annotated[float, nonzero]
-Flag = Annotated[bool, flag]
-Index = Annotated[int, integer_from_0]
-Count = Annotated[int, integer_from_1]
-Size = Annotated[int, array_size]
 
 
 def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
@@ -126,23 +92,11 @@ def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
     raise ValueError(f"{name} must be numbers, got {value!r}")
 
 
-@cache  # because `get_type_hints` is slow
-def _validators(controller_class: type) -> dict[str, Validator]:
-    """Return a dict from field names of a controller class to their validators."""
-    annotations = get_type_hints(controller_class, include_extras=True)
-    validators = {}
-    for name, annotation in annotations.items():
-        if hasattr(annotation, "__metadata__"):  # an `Annotated` type such as `Positive`
-            validators[name] = annotation.__metadata__[0]
-    return validators
-
-
 @dataclass(eq=False, kw_only=True)
 class Controller(ABC):
     """A controller of one control loop, or of a batch of independent control loops.
 
-    Every controller is a dataclass whose fields are the constructor arguments. The type of an
-    argument, such as `Positive`, states the values that the argument may have.
+    Every controller is a dataclass whose fields are the constructor arguments.
 
     Parameters
     ----------
@@ -166,8 +120,8 @@ class Controller(ABC):
         If a constructor argument is out of range. The message names the argument.
     """
 
-    u_min: Number = -10.0
-    u_max: Number = 10.0
+    u_min: float = -10.0
+    u_max: float = 10.0
     n_obs: int = field(init=False, repr=False)
     command: Values = field(init=False, repr=False)
 
@@ -180,16 +134,21 @@ class Controller(ABC):
     _remembers = True
 
     def __post_init__(self) -> None:
-        """Validate the constructor arguments, and call `reset`.
+        """Check the flow limits, and call `reset`.
 
-        A subclass must call `super().__post_init__()` first. This call runs `reset`, so `reset`
-        must not use attributes that a subclass sets after the call.
+        A subclass must call `super().__post_init__()` first, and then check its own arguments.
+        This call runs `reset`, so `reset` must not use attributes that a subclass sets after
+        the call.
         """
-        for name, validator in _validators(type(self)).items():
-            setattr(self, name, validator(name, getattr(self, name)))
+        self._check(finite, "u_min", "u_max")
         if self.u_min >= self.u_max:
             raise ValueError(f"u_min must be below u_max = {self.u_max!r}, got {self.u_min!r}")
         self.reset()
+
+    def _check(self, check: Callable[[str, Any], Any], *names: str) -> None:
+        """Replace the arguments `names` by what `check`, such as `positive`, returns."""
+        for name in names:
+            setattr(self, name, check(name, getattr(self, name)))
 
     def reset(self) -> None:
         """Forget past samples before a new episode, but keep learnt network weights."""
@@ -221,13 +180,10 @@ class Controller(ABC):
             If the controller does not fit the flow limits, the observations or the number of
             the plants, or if `wrapped` is not empty.
         """
-        # If the flow limits are random for each episode, the controller must have the widest
-        # limits.
-        limits = float(np.min(parameters.u_min)), float(np.max(parameters.u_max))
-        if limits != (self.u_min, self.u_max):
+        if (parameters.u_min, parameters.u_max) != (self.u_min, self.u_max):
             raise ValueError(
-                f"policy must have the flow limits of env, u_min={limits[0]}, "
-                f"u_max={limits[1]}, got {self.u_min}, {self.u_max}"
+                f"policy must have the flow limits of env, u_min={parameters.u_min}, "
+                f"u_max={parameters.u_max}, got {self.u_min}, {self.u_max}"
             )
         first = 0  # index of the signal's newest sample in the observation
         for signal in ("setpoint", "error"):
@@ -323,17 +279,15 @@ class ModelBasedController(Controller):
         Sampling interval, s.
     """
 
-    gain: Gain
-    time_constant: Positive
-    delay: NotNegative
-    dead_zone: NotNegative = 0.0
-    sampling_interval: Positive = 8.0
+    gain: float
+    time_constant: float
+    delay: float
+    dead_zone: float = 0.0
+    sampling_interval: float = 8.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check(nonzero, "gain")
+        self._check(positive, "time_constant", "sampling_interval")
+        self._check(not_negative, "delay", "dead_zone")
         self._edge = self.dead_zone
-        if self.delay / self.sampling_interval > LARGEST_SIZE:
-            raise ValueError(
-                f"delay must be at most {LARGEST_SIZE:,} times sampling_interval = "
-                f"{self.sampling_interval!r}, got {self.delay!r}"
-            )

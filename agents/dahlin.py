@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polysub
 from numpy.typing import NDArray
 
-from agents.controller import Index, NotNegative, Positive, Values
+from agents.controller import Values, from_0, not_negative, positive
 from agents.internal_model import InternalModelController
 
 Array = NDArray[np.float64]
@@ -59,13 +59,16 @@ class DahlinController(InternalModelController):
         Indices of the set point y_d(k) and the error e(k), both in degC, in an observation.
     """
 
-    closed_loop_time_constant: Positive
-    filter_time_constant: NotNegative = 0.0
-    setpoint_index: Index = 0
-    error_index: Index = 3
+    closed_loop_time_constant: float
+    filter_time_constant: float = 0.0
+    setpoint_index: int = 0
+    error_index: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check(positive, "closed_loop_time_constant")
+        self._check(not_negative, "filter_time_constant")
+        self._check(from_0, "setpoint_index", "error_index")
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
         self._approach = -math.expm1(-self.sampling_interval / self.closed_loop_time_constant)
         self._filter = 1.0

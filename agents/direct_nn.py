@@ -9,16 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import (
-    Controller,
-    Count,
-    Flag,
-    Index,
-    NotNegative,
-    Number,
-    Size,
-    array_size,
-)
+from agents.controller import Controller, finite, flag, from_0, from_1, not_negative
 from agents.networks import check_array, open_arrays, write_arrays
 
 Array = NDArray[np.float64]
@@ -119,29 +110,34 @@ class DirectNNController(Controller):
     ...     observation, reward, *_ = env.step(controller.act(observation))
     """
 
-    n_inputs: Size = 6
-    n_hidden: Size = 3
+    n_inputs: int = 6
+    n_hidden: int = 3
     # The random search `benchmarks.tune nn` of version 0.1 found these learning rates and
     # scales.
-    eta: NotNegative = 5.3
-    eta_1: NotNegative = 0.0303
-    eta_theta: NotNegative = 0.0462
-    eta_1_theta: NotNegative = 0.0372
-    direction: Number = -1
-    input_scale: Number = 0.021
-    weight_scale: NotNegative = 1.68
-    error_index: Index = 3
-    seed: Index = 0
+    eta: float = 5.3
+    eta_1: float = 0.0303
+    eta_theta: float = 0.0462
+    eta_1_theta: float = 0.0372
+    direction: float = -1
+    input_scale: float = 0.021
+    weight_scale: float = 1.68
+    error_index: int = 3
+    seed: int = 0
     num_envs: int | None = None
-    learning: Flag = True
-    update_interval: Count = 1
+    learning: bool = True
+    update_interval: int = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check(from_1, "n_inputs", "n_hidden", "update_interval")
+        self._check(not_negative, "eta", "eta_1", "eta_theta", "eta_1_theta", "weight_scale")
+        self._check(finite, "direction", "input_scale")
+        self._check(from_0, "error_index", "seed")
+        self._check(flag, "learning")
         if abs(self.direction) != 1.0:
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
         if self.num_envs is not None:
-            array_size("num_envs", self.num_envs)
+            self._check(from_1, "num_envs")
         self.n_obs = max(self.n_inputs, self.error_index + 1)
         # Shapes of one network's weights.
         self._shapes = {

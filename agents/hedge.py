@@ -27,14 +27,13 @@ class RandomSetpoint:
 
     The set point is piecewise constant. The values of the set point are independent and
     uniformly distributed. The number of samples between two changes is uniformly distributed.
-    Each field of `RandomSetpoint` is an array of shape (n,), or one number for all loops.
     """
 
-    shortest: Array | float
+    shortest: float
     """Least number of samples between two changes of the set point."""
-    longest: Array | float
+    longest: float
     """Greatest number of samples between two changes of the set point."""
-    amplitude: Array | float
+    amplitude: float
     """Greatest value of the set point, in any unit of temperature; the least value is
     `-amplitude`."""
 

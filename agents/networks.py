@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.controller import Controller, Values, check_numbers, integer_from_0, not_negative
+from agents.controller import Controller, Values, check_numbers, from_0, not_negative
 
 Array = NDArray[np.floating[Any]]
 # Layers of a network in the order of computation. Each layer is a pair of weights, shape
@@ -236,7 +236,7 @@ class PolicyNetwork(Controller):
                     f"observation must have only the keys {', '.join(WINDOWS)}, got {name!r}"
                 )
         self.observation = {
-            name: integer_from_0(f"observation[{name!r}]", self.observation.get(name, 0))
+            name: from_0(f"observation[{name!r}]", self.observation.get(name, 0))
             for name in WINDOWS
         }
         self.n_obs = sum(self.observation.values())

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from agents.controller import (
     Controller,
-    Flag,
-    Index,
-    Number,
     Values,
+    finite,
+    flag,
+    from_0,
     nonzero,
     not_negative,
     positive,
@@ -51,13 +51,16 @@ class PIController(Controller):
         Index of the error e(k), degC, in an observation.
     """
 
-    kp: Number = field(default=2.2, kw_only=False)
-    ki: Number = field(default=0.3, kw_only=False)
-    anti_windup: Flag = False
-    error_index: Index = 3
+    kp: float = field(default=2.2, kw_only=False)
+    ki: float = field(default=0.3, kw_only=False)
+    anti_windup: bool = False
+    error_index: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check(finite, "kp", "ki")
+        self._check(flag, "anti_windup")
+        self._check(from_0, "error_index")
         self.n_obs = self.error_index + 1
 
     @classmethod

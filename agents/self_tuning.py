@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.bank import Bank, Prior
-from agents.controller import Index, ModelBasedController, Positive
+from agents.controller import ModelBasedController, from_0, positive
 from agents.hedge import RandomSetpoint
 from agents.law import Law
 
@@ -51,9 +51,6 @@ def _time_range(name: str, value: Any) -> tuple[float, float] | None:
             f"got {value!r}"
         )
     return shortest, longest
-
-
-TimeRange = Annotated[tuple[float, float] | None, _time_range]
 
 
 def _transport_delay(delay: float) -> int:
@@ -109,14 +106,17 @@ class SelfTuningController(ModelBasedController):
         Indices of the set point y_d(k) and the error e(k), both in degC, in an observation.
     """
 
-    delay_range: TimeRange = None
-    setpoint_holds: TimeRange = None
-    setpoint_amplitude: Positive = 5.0
-    setpoint_index: Index = 0
-    error_index: Index = 3
+    delay_range: tuple[float, float] | None = None
+    setpoint_holds: tuple[float, float] | None = None
+    setpoint_amplitude: float = 5.0
+    setpoint_index: int = 0
+    error_index: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check(_time_range, "delay_range", "setpoint_holds")
+        self._check(positive, "setpoint_amplitude")
+        self._check(from_0, "setpoint_index", "error_index")
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
         # On a slow plant, the controller changes the command at every `_samples_held`-th
         # sample. The time constant, divided by the interval between these samples, is then at

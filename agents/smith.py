@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
-from agents.controller import Index, Positive, Values
+from agents.controller import Values, from_0, positive
 from agents.internal_model import InternalModelController
 from agents.pi import PIController
 
@@ -53,11 +53,13 @@ class SmithPredictor(InternalModelController):
         Integral gain of the PI controller, t/h per degC and sample.
     """
 
-    closed_loop_time_constant: Positive
-    error_index: Index = 3
+    closed_loop_time_constant: float
+    error_index: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check(positive, "closed_loop_time_constant")
+        self._check(from_0, "error_index")
         rule = PIController.simc(
             gain=self.gain,
             time_constant=self.time_constant,

@@ -495,7 +495,7 @@ BAD = {
     partial(DahlinController, **TUNED): [
         ("closed_loop_time_constant", 0.0), ("filter_time_constant", -1.0),
     ],
-    partial(SmithPredictor, **TUNED): [("delay", -8.0), ("delay", 1e12), ("dead_zone", np.nan)],
+    partial(SmithPredictor, **TUNED): [("delay", -8.0), ("dead_zone", np.nan)],
     partial(SelfTuningController, **STEP_TEST): [
         ("delay_range", (0.0, np.inf)), ("delay_range", (160.0, 80.0)),
         ("delay_range", ("a", 5.0)), ("delay_range", 5.0),
