@@ -49,7 +49,9 @@ RESULTS = {name: task() for name, task in WORK.items()}
 def test_jobs_and_order_do_not_matter():
     slow = WORK | {"plant 0": partial(draw, 0, 0.3)}  # The first task is not ready first.
     for tasks, jobs in ((slow, 1), (slow, 2), (dict(reversed(slow.items())), 2)):
-        assert FanOut(jobs=jobs).run(tasks, "tasks") == (RESULTS, None)
+        finished = FanOut(jobs=jobs).run(tasks, "tasks")
+        assert finished == (RESULTS, None)
+        assert [*finished.results] == [*tasks]
     processes = FanOut(jobs=2).run({"one": os.getpid, "two": os.getpid}, "tasks").results
     assert os.getpid() not in processes.values()
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from benchmarks.lib.command import Count, Seed, command, options
+from benchmarks.lib.command import Count, command, options
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.outputs import ROOT, commit, versions, write_json
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions, Scenario
@@ -73,12 +73,6 @@ class Options:
     """Instead of the table, write the file of bounds that ships with the package mptc_gym."""
     fan_out: FanOut = field(default_factory=FanOut)
     plant: PlantOptions = field(default_factory=PlantOptions)
-    samples: Count | None = None
-    """Length of an episode, samples (default: the length of the case)."""
-    episodes: Count = EPISODES
-    """Number of episodes over which a bound is averaged, if plants or set points are random."""
-    seed: Seed = SEED
-    """Seed of the first episode; each later episode has the next seed."""
 
 
 def work(options: Options) -> None:
@@ -96,14 +90,13 @@ def work(options: Options) -> None:
     if options.package:
         write_package(options.fan_out)
         return
-    tasks = {name: partial(row, case, options) for name, case in cases.items()}
+    tasks = {name: partial(row, case, options.mpc) for name, case in cases.items()}
     title = "Mean absolute error in °C"
     if options.plant.name:
         title += f", plant: {options.plant.name}"
     print(f"{title}:", flush=True)
     finished = options.fan_out.run(tasks, "bounds")
-    rows = [finished.results[name] for name in tasks if name in finished.results]
-    print(on_screen(pd.DataFrame(rows)))
+    print(on_screen(pd.DataFrame(list(finished.results.values()))))
     print(description())
     if finished.error:
         raise finished.error
@@ -119,9 +112,10 @@ def description() -> str:
     return "\n".join(lines)
 
 
-def row(case: Scenario, options: Options) -> dict[str, str]:
+def row(case: Scenario, mpc_runs: int | None) -> dict[str, str]:
     """Return a case's row of the printed table: mean errors, degC, as texts by column heading.
 
+    If `mpc_runs` is not None, the row has the error of so many runs of MPC.
     The returned text is "" for the column "without preview" if set points are not random, and
     for the column "reference" if the set point changes before the plant has settled.
     """
@@ -131,22 +125,15 @@ def row(case: Scenario, options: Options) -> dict[str, str]:
     from benchmarks.lib.statistics import bootstrap
     from benchmarks.loop.rollout import mean_error
 
-    samples = options.samples or case.samples
-    arguments: dict[str, Any] = {
-        "samples": samples,
-        "episodes": options.episodes,
-        "seed": options.seed,
-        **case.arguments,
-    }
-    cells = {"case": case.name}
+    least = partial(least_possible, samples=case.samples, **case.arguments)
     # Formatting an `Estimate`, as in f"{estimate:.4f}", adds the interval in parentheses.
-    cells["idle valve"] = f"{least_possible(kind='preview', **arguments).idle:.4f}"
+    cells = {"case": case.name, "idle valve": f"{least(kind='preview').idle:.4f}"}
     for kind, heading in HEADINGS.items():
         cells[heading] = ""
         with suppress(NoBoundError):
-            cells[heading] = f"{least_possible(kind=kind, **arguments):.4f}"
-    if options.mpc:
-        runs = ROSTER["mpc"].run(case.arguments, samples, options.mpc, options.seed)
+            cells[heading] = f"{least(kind=kind):.4f}"
+    if mpc_runs:
+        runs = ROSTER["mpc"].run(case.arguments, case.samples, mpc_runs, SEED)
         cells["MPC"] = f"{bootstrap(mean_error(runs), seed=0):.4f}"
     return cells
 
@@ -170,7 +157,7 @@ def write_package(fan_out: FanOut) -> None:
         "episodes": PACKAGED_EPISODES,
         "validation_seed": VALIDATION_SEED,
         "validation_episodes": VALIDATION_EPISODES,
-        "cases": {name: finished.results[name] for name in PACKAGED},
+        "cases": finished.results,
     }
     write_json(PACKAGE_FILE, content)
     print(f"Written to {PACKAGE_FILE}")

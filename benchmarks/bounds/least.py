@@ -128,12 +128,9 @@ def least_possible(
         If `kind` is "causal" and set points are not random, or if `kind` is "reference" and the
         set point changes before the plant has settled.
     ValueError
-        If `samples`, `episodes`, `kind` or an argument of the environment is not allowed.
+        If `kind` or an argument of the environment is not allowed.
     """
     parameters = Parameters(**arguments)
-    for name, count in (("samples", samples), ("episodes", episodes)):
-        if not isinstance(count, int) or count < 1:
-            raise ValueError(f"{name} must be an integer of at least 1, got {count!r}")
     if kind is not None and kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
     has_random_setpoint = parameters.setpoint == "random"

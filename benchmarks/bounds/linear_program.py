@@ -1,6 +1,5 @@
 """Find the flows with the least expected error in an episode by linear programming."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,9 +12,6 @@ from benchmarks.loop.rollout import held
 
 Array = NDArray[np.float64]
 
-# Effects of a flow on an output that are smaller than this fraction of the largest effect are
-# set to 0, so that the matrix of the linear program is sparse.
-NEGLIGIBLE_RESPONSE = 1e-9
 # Values of the arguments `method` and `presolve` of `scipy.optimize.linprog`. The pairs are
 # tried in turn, since a pair fails for a few plants.
 SOLVERS = ("highs-ds", True), ("highs-ds", False), ("highs-ipm", True)
@@ -175,173 +171,108 @@ def plan(
     flow = np.zeros(samples)
     past_count = np.size(past)
     flow[:past_count] = past
+    A, B = equations(model, samples)
     if past_count < samples - 1:
+        error_of_past = setpoint - scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
         price = np.broadcast_to(np.asarray(penalty, float), samples)
-        program = _program(model, bounds, setpoint, flow, past_count, quiet, price)
-        flow[past_count:-1] = _solve(program, zeros=np.roots(model.parameters.b))
+        program = _program(model, bounds, error_of_past, flow[:past_count], quiet, price)
+        chosen = samples - 1 - past_count  # number of flows
+        # The variables of the program are the outputs, the flows and others.
+        flow[past_count:-1] = _solve(program)[chosen : 2 * chosen]
     if samples > 1:
         flow[-1] = flow[-2]  # The last flow affects no output, so the valve need not move.
-    A, B = equations(model, samples)
     output = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
     return Plan(bounds.mean_error(setpoint - output), flow)
-
-
-class _Variables(NamedTuple):
-    """Costs and bounds of variables of a linear program, in arrays of shape (variables,)."""
-
-    cost: Array  # cost of each unit of a variable
-    low: Array  # lower bound of a variable
-    high: Array  # upper bound of a variable
-
-
-def _variables(count: int, cost: Any, low: Any, high: Any) -> _Variables:
-    """Return the costs and bounds of `count` variables of a linear program.
-
-    `cost`, `low` and `high` are arrays of shape (count,), or numbers that apply to all
-    variables.
-    """
-    return _Variables(*(np.broadcast_to(values, count) for values in (cost, low, high)))
-
-
-class _Program(NamedTuple):
-    """The linear program that chooses the n flows between the past flows and the last flow.
-
-    The past flows are fixed, and the last flow of the episode affects no output.
-    The effects y of the n flows u on the outputs satisfy A y = B u, where A and B are the
-    plant's matrices in equation (28) of the paper. The linear program writes the expected error
-    at each sample as a sum of positive pieces minus a sum of negative pieces, with one piece of
-    each sign for every slope of the lower bound of the mean error. The effect of the n flows on
-    output k plus the expected error of output k equals `targets[k]`, the set point minus the
-    effect of the past flows, degC, where k counts from 0 to n - 1. If the argument `quiet` of
-    `plan` is true, the linear program has n more equations: flow k minus flow k - 1, minus the
-    upward move of the valve, plus the downward move of the valve, equals `targets[n + k]`. Flow
-    -1 counts as 0, so the element `targets[n]` is the last of the past flows, t/h. The later
-    elements of `targets` are 0.
-    """
-
-    A: Any  # sparse matrix of the plant, shape (n, n)
-    B: Any  # sparse matrix of the plant, shape (n, n)
-    targets: Array  # right sides, shape (n,), or (2 n,) if `quiet` is true
-    outputs: _Variables  # effects of the n flows on the outputs, degC, n variables
-    flows: _Variables  # the n flows, t/h
-    # Pieces of the expected errors, degC: n positive and n negative pieces for each slope.
-    pieces: _Variables
-    moves: _Variables  # t/h; n upward and n downward moves if `quiet` is true, else none
 
 
 def _program(
     model: LinearModel,
     bounds: ErrorBounds,
-    setpoint: Array,
-    flow: Array,
-    past_count: int,
+    error_of_past: Array,
+    past: Array,
     quiet: bool,
     price: Array,
-) -> _Program:
-    """Return the linear program that chooses the flows after the first `past_count` flows.
+) -> dict[str, Any]:
+    """Return the linear program that chooses the n flows between past flows and last flow.
 
-    The linear program leaves out the last flow of the episode, which affects no output.
-    `model`, `bounds`, `setpoint` and `quiet` are arguments of `plan`. `flow` has the
-    `past_count` past flows, which are fixed, and then zeros, t/h, shape (samples,). `price` has
-    the price of each flow, degC per t/h, shape (samples,).
+    The result has the arguments of `scipy.optimize.linprog`. The variables are, in this order:
+
+    - the effects y of the n flows on the n outputs after the past flows, degC;
+    - the n flows u, t/h;
+    - pieces of the expected errors, degC: n positive and n negative pieces for each slope of
+      the lower bound of the mean error;
+    - if `quiet` is true, n upward and n downward moves of the valve, t/h.
+
+    The equations are A y = B u, where A and B are the plant's matrices in equation (28) of the
+    paper; y plus the positive pieces minus the negative pieces equals the error without the n
+    flows; and, if `quiet` is true, each flow minus the previous flow equals the upward minus
+    the downward move. With outputs among the variables, the linear program is sparse, so that
+    solvers are fast even if the plant is slow.
+
+    Parameters
+    ----------
+    model, bounds, quiet
+        Arguments of `plan`.
+    error_of_past
+        Expected errors if all flows after the past flows are 0, degC, shape (samples,).
+    past
+        Past flows, which are fixed, t/h, shape (count,).
+    price
+        Price of each flow, degC per t/h, shape (samples,).
     """
-    samples = len(setpoint)
-    first = past_count + 1  # sample of the first output after the past flows
+    samples = len(error_of_past)
+    count = len(past)
+    first = count + 1  # sample of the first output after the past flows
     n = samples - first
     A, B = equations(model, samples)
-    output_of_past = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
-    targets = (setpoint - output_of_past)[first:]
+    eye = scipy.sparse.eye_array(n)
     slopes = bounds.slopes
-    moves = 0
     if quiet:
         # A line may have the slope 0 near an error of 0, but a quiet plan needs a slope above 0
         # to end at the set point.
         slopes = np.maximum(slopes, SMALLEST_SLOPE)
-        last_flow = flow[past_count - 1]  # 0 if there are no past flows
-        targets = np.concatenate([targets, [last_flow], np.zeros(n - 1)])
-        moves = 2 * n
-    # Upper bounds of the pieces, in the order of `_Program.pieces`.
+    signs = scipy.sparse.hstack([eye, -eye] * len(slopes))
+    blocks = [[A[first:, first:], -B[first:, count:-1], None], [eye, None, signs]]
+    right = [np.zeros(n), error_of_past[first:]]
     lengths = np.repeat(bounds.lengths[first:samples], 2, axis=1).T.ravel()
-    return _Program(
-        A=A[first:, first:],
-        B=B[first:, past_count:-1],
-        targets=targets,
-        outputs=_variables(n, 0.0, -np.inf, np.inf),
-        flows=_variables(n, price[past_count:-1], *model.limits),
-        pieces=_variables(len(lengths), np.repeat(slopes, 2 * n), 0.0, lengths),
-        moves=_variables(moves, TRAVEL_PRICE, 0.0, np.inf),
-    )
+    costs = [np.zeros(n), price[count:-1], np.repeat(slopes, 2 * n)]
+    low = [np.full(n, -np.inf), np.full(n, model.limits[0]), np.zeros(len(lengths))]
+    high = [np.full(n, np.inf), np.full(n, model.limits[1]), lengths]
+    if quiet:
+        differences = eye - scipy.sparse.eye_array(n, k=-1)  # flow k minus flow k - 1
+        moves = scipy.sparse.hstack([-eye, eye])
+        blocks = [[*row, None] for row in blocks]
+        blocks.append([None, differences, None, moves])
+        last_flow = past[-1] if count else 0.0
+        right.append(np.append(last_flow, np.zeros(n - 1)))
+        costs.append(np.full(2 * n, TRAVEL_PRICE))
+        low.append(np.zeros(2 * n))
+        high.append(np.full(2 * n, np.inf))
+    return {
+        "c": np.concatenate(costs),
+        "A_eq": scipy.sparse.block_array(blocks).tocsc(),
+        "b_eq": np.concatenate(right),
+        "bounds": np.column_stack([np.concatenate(low), np.concatenate(high)]),
+    }
 
 
-def _solve(program: _Program, zeros: NDArray[Any]) -> Array:
-    """Return the flows of a linear program with the least cost, t/h, shape (n,).
+def _solve(program: dict[str, Any]) -> Array:
+    """Return the variables of a linear program with the least cost, shape (variables,).
 
-    `zeros` has the zeros of the polynomial B in equation (28) of the paper. A RuntimeError is
-    raised if no solver solves `program` within `TIME_LIMIT` seconds.
+    A RuntimeError is raised if no solver solves `program` within `TIME_LIMIT` seconds.
     """
-    n = len(program.flows.cost)
-    # With outputs among the variables, the linear program is sparse, so solvers are fast even
-    # if the plant is slow. But if a zero of B lies outside the unit circle, the flow that
-    # produces a given output grows without bound: solvers that choose outputs freely fail, or
-    # end away from the optimum.
-    outputs_first = bool(np.all(np.abs(zeros) <= 1.0))
-    for with_outputs in (outputs_first, not outputs_first):
-        matrix, right = _equalities(program, with_outputs)
-        variables: Sequence[_Variables] = program.flows, program.pieces, program.moves
-        if with_outputs:
-            variables = program.outputs, *variables
-        cost, low, high = np.hstack(variables)
-        for method, presolve in SOLVERS:
-            solution = scipy.optimize.linprog(
-                cost,
-                A_eq=matrix,
-                b_eq=right,
-                bounds=np.column_stack([low, high]),
-                method=method,
-                options={"time_limit": TIME_LIMIT, "presolve": presolve},
-            )
-            if solution.success:
-                first_flow = n if with_outputs else 0
-                flows: Array = solution.x[first_flow : first_flow + n]
-                return flows
+    for method, presolve in SOLVERS:
+        solution = scipy.optimize.linprog(
+            **program,
+            method=method,
+            options={"time_limit": TIME_LIMIT, "presolve": presolve},
+        )
+        if solution.success:
+            return np.asarray(solution.x, np.float64)
     raise RuntimeError(
-        f"scipy.optimize.linprog did not solve the linear program with {n} flows in "
-        f"{2 * len(SOLVERS)} attempts: {solution.message}"
+        f"scipy.optimize.linprog did not solve the linear program with {len(program['c'])} "
+        f"variables in {len(SOLVERS)} attempts: {solution.message}"
     )
-
-
-def _equalities(program: _Program, with_outputs: bool) -> tuple[Any, Array]:
-    """Return the equality constraints M x = r of a linear program: a sparse M and a vector r.
-
-    If `with_outputs` is true, the vector x has the outputs and then the flows, pieces and valve
-    moves of `program`. If `with_outputs` is false, x does not have the outputs, since the
-    equations express the outputs by the flows.
-    """
-    n = len(program.flows.cost)
-    rows = len(program.targets)
-    eye = scipy.sparse.eye_array(n)
-    differences = eye - scipy.sparse.eye_array(n, k=-1)  # flow k minus flow k - 1
-    slopes = len(program.pieces.cost) // (2 * n)
-    # Columns of the matrix M in the rows of the targets. The first n rows have the coefficients
-    # of the outputs and pieces. The next n rows, which only a quiet plan has, have the
-    # coefficients of the flows and moves.
-    output_columns = scipy.sparse.eye_array(rows, n)
-    flow_columns = scipy.sparse.eye_array(rows, n, k=-n, format="csr") @ differences
-    piece_columns = scipy.sparse.hstack([eye, -eye] * slopes)
-    if rows > n:  # The columns of the moves follow the columns of the pieces.
-        move_columns = scipy.sparse.hstack([-eye, eye])
-        piece_columns = scipy.sparse.block_diag([piece_columns, move_columns])
-    if with_outputs:
-        plant_rows = [program.A, -program.B, None]
-        blocks: Any = [plant_rows, [output_columns, flow_columns, piece_columns]]
-        right = np.concatenate([np.zeros(n), program.targets])
-    else:
-        G = response(program.A, program.B)
-        G[np.abs(G) < NEGLIGIBLE_RESPONSE * np.abs(G).max(initial=0.0)] = 0.0
-        effects = output_columns @ scipy.sparse.csr_array(G)
-        blocks = [[effects + flow_columns, piece_columns]]
-        right = program.targets
-    return scipy.sparse.block_array(blocks).tocsc(), right
 
 
 def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:

@@ -12,9 +12,6 @@ from benchmarks.loop.linear import LinearModel
 
 Array = NDArray[np.float64]
 
-# Least variance of readings in the Kalman filter, degC^2, to avoid a division by 0.
-SMALLEST_VARIANCE = 1e-8
-
 
 def noise_variance(model: LinearModel) -> Array:
     """Return the error variances of the best output predictions, degC^2, shape (samples,).
@@ -23,25 +20,12 @@ def noise_variance(model: LinearModel) -> Array:
     k - lag, where lag is `model.lag`. `model` is a plant at the samples k = 0, 1, ... of an
     episode. The load of the plant counts as 0.
     """
-    F, Q = noise_system(model)
-    reading_variance = model.numbers.measurement_noise_variance
-    filtered = np.zeros_like(F)  # Readings without noise show the state.
-    if reading_variance > 0.0:
-        filtered = filtered_covariance(F, Q, reading_variance)
-    return predicted_variance(filtered, F, Q, model.lag)
-
-
-def noise_system(model: LinearModel) -> tuple[Array, Array]:
-    """Return the matrices F(k) and Q(k) of the state equation of a plant without load.
-
-    The state equation is x(k) = F(k) x(k-1) + v(k), where x(k) is the state of
-    `LinearModel.state_space`, whose first element is the output y(k), degC, and v(k) is white
-    noise with the covariance matrix Q(k). The two returned arrays have the shape (samples,
-    size, size), where size is the length of the state x(k).
-    """
     F, g = model.state_space()
-    covariance = model.numbers.noise_variance * np.outer(g, g)
-    return F, np.broadcast_to(covariance, F.shape)
+    Q = np.broadcast_to(model.numbers.noise_variance * np.outer(g, g), F.shape)
+    filtered = np.zeros_like(F)  # Readings without noise show the state exactly.
+    if model.numbers.measurement_noise_variance > 0.0:
+        filtered = filtered_covariance(F, Q, model.numbers.measurement_noise_variance)
+    return predicted_variance(filtered, F, Q, model.lag)
 
 
 def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
@@ -64,8 +48,7 @@ def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
     P = filtered[0]
     for k in range(1, len(F)):
         P = F[k] @ P @ F[k].T + Q[k]
-        innovation_variance = P[0, 0] + max(reading_variance, SMALLEST_VARIANCE)
-        P = P - np.outer(P[:, 0], P[0]) / innovation_variance
+        P = P - np.outer(P[:, 0], P[0]) / (P[0, 0] + reading_variance)
         filtered[k] = P
     return filtered
 

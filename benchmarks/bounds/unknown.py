@@ -96,11 +96,11 @@ def error_bounds(model: LinearModel) -> ErrorBounds:
     # largest_step, degC.
     largest_step = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
     amplitude = numbers.disturbance_amplitude
-    if not (largest_step or amplitude):
-        return bounds_for_normal(noise_variance(model))
-
+    variance = noise_variance(model)
+    if not (variance.any() or largest_step or amplitude):
+        return ErrorBounds(np.ones(1), np.zeros((len(variance), 1)))
     changes = load_changes(model)
-    noise = normal(noise_variance(model), NOISE_ATOMS)
+    noise = normal(variance, NOISE_ATOMS)
     if largest_step:
         for effect in changes.effects.T:
             step = uniform(largest_step * effect, WALK_ATOMS)
@@ -110,19 +110,6 @@ def error_bounds(model: LinearModel) -> ErrorBounds:
     jump_probability = min(1.0, LOAD_INTERVAL / numbers.disturbance_interval)
     intercepts = _intercepts_with_jumps(changes, noise, amplitude, jump_probability)
     return ErrorBounds(SLOPES, intercepts)
-
-
-def bounds_for_normal(variance: Array) -> ErrorBounds:
-    """Return lower bounds of the mean errors if inevitable errors are normally distributed.
-
-    The inevitable error is the part of the error that no flow can counteract in time. The
-    inevitable error has the mean 0 and, at each sample, the variance `variance`, degC^2, shape
-    (samples,).
-    """
-    if not variance.any():
-        return ErrorBounds(np.ones(1), np.zeros((len(variance), 1)))
-    distribution = normal(variance, NOISE_ATOMS)
-    return ErrorBounds(SLOPES, least_mean_distances(distribution, SLOPES))
 
 
 class LoadChanges(NamedTuple):

@@ -38,8 +38,7 @@ def work(options: Options) -> None:
     # The tests of the last claims take longest, so these tests start first.
     tasks = {name: partial(examined, name, batch) for name in reversed(names)}
     finished = options.fan_out.run(tasks, "claims")
-    in_order = {name: finished.results[name] for name in names if name in finished.results}
-    numbers = table(CLAIMS, in_order)
+    numbers = table(CLAIMS, dict(reversed(finished.results.items())))
     report = sections(CLAIMS, numbers)
     write_csv(folder / "claims.csv", numbers)
     write_report(folder, "The paper's claims", report, provenance, finished.error)

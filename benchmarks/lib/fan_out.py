@@ -27,7 +27,7 @@ class Outcome(NamedTuple):
 class Finished(NamedTuple):
     """The results of the tasks that have finished, and why others are missing."""
 
-    results: dict[str, Any]  # what the tasks returned, by name
+    results: dict[str, Any]  # what the tasks returned, by name, in the order of the tasks
     # An error that names the missing tasks, to be raised when the results are written; None if
     # all tasks have finished.
     error: CommandError | None
@@ -90,6 +90,7 @@ class FanOut:
             status = 130
         except BrokenProcessPool as killed:  # The system may have run out of memory.
             reason = f"{killed}: "
+        results = {name: results[name] for name in tasks if name in results}
         missing = len(tasks) - len(results)
         if not missing:
             return Finished(results, None)
