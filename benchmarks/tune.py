@@ -6,14 +6,15 @@ import json
 import math
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.controllers.plant_scale import scale_of
+from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.spans import Spans
 from benchmarks.lib.command import CommandError, Count, Folder, Parameter, command, options
 from benchmarks.lib.fan_out import with_progress_bar
 from benchmarks.lib.outputs import new_folder, provenance_of, write_csv, write_json
@@ -178,7 +179,7 @@ def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
 
     rows = []
     for other, origin_of_gains in FIXED_GAINS[name].items():
-        controller = ROSTER[other].make(plant, 1, 0)
+        controller: Any = ROSTER[other].start(plant, 1, 0)[0]
         gains = {gain: getattr(controller, gain) for gain in spans_of(name, plant)}
         objective = score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, gains)["objective"]
         numbers = {**gains, "objective": objective}
@@ -187,7 +188,7 @@ def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
+def spans_of(name: str, plant: Arguments) -> Spans:
     """Return the range in which to search for each gain of a controller, by the gain's name.
 
     A range is a pair of values with the same sign: the value with the smallest magnitude, and
@@ -195,7 +196,7 @@ def spans_of(name: str, plant: Arguments) -> Mapping[str, tuple[float, float]]:
     time constant that defines the ranges.
     """
     try:
-        return SPANS[name](Parameters(**plant))
+        return SPANS[name](KnownPlant(Parameters(**plant)))
     except ValueError as error:
         raise CommandError(f"--plant: {error}") from error
 
@@ -214,8 +215,8 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     duration = parameters.setpoint_period / PAPER.setpoint_period
     noise = middle(parameters, "noise_variance") / PAPER_NOISE
     if noise == 0.0:  # The noise variance is scaled with the square of temperature changes.
-        scale, paper_scale = scale_of(parameters), scale_of(PAPER)
-        noise = (scale.temperature_range / paper_scale.temperature_range) ** 2
+        paper_range = KnownPlant(PAPER).temperature_range
+        noise = (KnownPlant(parameters).temperature_range / paper_range) ** 2
     factors = {
         "setpoint": amplitude,
         "setpoint_amplitude": amplitude,
@@ -330,7 +331,7 @@ def score(
     gains
         The gains by name.
     """
-    controller = ROSTER[name].with_gains(gains)
+    controller = replace(ROSTER[name], arguments=gains)
     medians: dict[str, float] = {}
     unsettled = 0.0
     for i, (case_name, case) in enumerate(cases(plant).items()):

@@ -17,10 +17,12 @@ import pytest
 
 from agents import PIController
 from benchmarks.bounds.least import least_possible
-from benchmarks.compare import comparison, plots, report
+from benchmarks.compare import plots, report, runs
 from benchmarks.compare.__main__ import main
-from benchmarks.compare.comparison import estimate, ranked, scale_of
-from benchmarks.controllers.roster import ROSTER, looks
+from benchmarks.compare.estimates import estimate, ranked
+from benchmarks.compare.runs import least_error, run_case
+from benchmarks.controllers.own import own_controllers
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop.rollout import make_plants, measure, rollout
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
@@ -102,26 +104,16 @@ def some_runs(**errors):
     )
 
 
-def a_comparison(**results):
-    """Return a comparison with some results, and empty ones in place of the others."""
-    empty = pd.DataFrame()
-    return report.Comparison(
-        **{
-            "controllers": ROSTER, "results": [], "scales": {}, "runs": empty,
-            "estimates": empty, "misfits": {}, "scores": {}, **results,
-        }
-    )  # fmt: skip
-
-
 class TestEstimates:
     def test_by_hand(self):
-        scale = scale_of(SCENARIOS["constant"], 3, SEED)
-        limit = scale.least.value
-        runs = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
-        found = estimate(runs.assign(scenario="constant"), {"constant": scale})
+        bound = least_error(SCENARIOS["constant"], 3, SEED)
+        least = bound.least
+        rows = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
+        rows = rows.assign(scenario="constant")
+        found = estimate(rows, [bound], ROSTER)
         nn, ppo_ = found.to_dict("records")
-        assert (nn["mean"].value, nn["limit"]) == (2.0, limit)
-        assert nn["ratio"].value == pytest.approx(2.0 / limit)
+        assert (nn["mean"].value, nn["limit"]) == (2.0, least.value)
+        assert nn["ratio"].value == pytest.approx(2.0 / least.value)
         assert ppo_["mean"].value == pytest.approx(1.5)
         assert ppo_["difference"].value == pytest.approx(-0.5)
         assert ppo_["improvement"].value == pytest.approx((1 + 0.5 + 1 + 0 + 0.5 + 1) / 6)
@@ -129,39 +121,30 @@ class TestEstimates:
         assert nn["mean"].low < nn["mean"].value < nn["mean"].high
 
     def test_a_score_by_hand_and_the_best_comes_first(self):
-        scales = {name: scale_of(SCENARIOS[name], 1, SEED) for name in ("constant", "square")}
+        bounds = [least_error(SCENARIOS[name], 1, SEED) for name in ("constant", "square")]
         rows = []
-        for name, scale in scales.items():
-            least, idle = scale.least.value, scale.least.idle.value
-            half = (least + idle) / 2
-            runs = some_runs(a=[[idle, half]], b=[[least, half]])
-            rows.append(runs.assign(scenario=name, total_variation=12.0))
-        runs = pd.concat(rows)
-        found = estimate(runs, scales)
-        scores = ranked(found, {})
-        assert scores["b"].value == pytest.approx(0.75)
-        best, other = report.score_table(
-            a_comparison(runs=runs, estimates=found, scores=scores)
-        ).to_dict("records")
-        assert (best["controller"], best["travel (t/h)"], best["square"]) == (
-            "b", "12", "0.75",
-        )  # fmt: skip
-        assert (other["controller"], other["constant"]) == ("a", "0.25")
+        for scenario, least in bounds:
+            half = (least.value + least.idle.value) / 2
+            errors = some_runs(pi=[[least.idle.value, half]], nn=[[least.value, half]])
+            rows.append(errors.assign(scenario=scenario.name))
+        scores = ranked(estimate(pd.concat(rows), bounds, ROSTER))
+        assert [*scores] == ["nn", "pi"]
+        assert scores["nn"].value == pytest.approx(0.75)
+        assert scores["pi"].value == pytest.approx(0.25)
 
     def test_runs_that_are_alike_are_what_each_of_them_is(self, monkeypatch):
-        once = comparison.run_case(SCENARIOS["constant"], ROSTER["smith"], 3, SEED)
-        monkeypatch.setattr(comparison, "is_random", lambda _: True)
-        each = comparison.run_case(SCENARIOS["constant"], ROSTER["smith"], 3, SEED)
-        pd.testing.assert_frame_equal(once.runs, each.runs, rtol=1e-12)
-        pd.testing.assert_frame_equal(once.responses, each.responses, rtol=1e-12)
+        once = run_case(SCENARIOS["constant"], ROSTER["smith"], 3, SEED)
+        monkeypatch.setattr(runs, "is_random", lambda _: True)
+        each = run_case(SCENARIOS["constant"], ROSTER["smith"], 3, SEED)
+        for one, other in ((once.runs[0], each.runs[0]), (once.responses, each.responses)):
+            expected = pd.DataFrame(other)
+            pd.testing.assert_frame_equal(pd.DataFrame(one), expected, rtol=1e-12)
 
 
-def test_a_controller_has_one_look_wherever_it_is_listed():
-    everyone = looks([*ROSTER, "mine", "yours"])
-    assert len(set(everyone.values())) == len(everyone)
-    assert looks(["yours", "pi", "mine"]) == {
-        name: everyone[name] for name in ("yours", "pi", "mine")
-    }
+def test_each_controller_has_its_own_look():
+    own = own_controllers([f"{name}=agents:PIController" for name in "abcd"])
+    looks = [controller.look for controller in {**ROSTER, **own}.values()]
+    assert len(set(looks)) == len(looks)
 
 
 @pytest.fixture
@@ -199,9 +182,9 @@ class TestCompare:
         limit = least_possible(samples=600, kind="reference", setpoint=5.0).value
         error = pd.read_csv(out / "runs.csv").query("agent == 'pi'")["mae"].iloc[0]
         page, screen = (out / "report.md").read_text(), capsys.readouterr().out
-        for shown in (page, screen):
-            assert f"{limit:.3f}" in shown
-            assert f"{error / limit:.2f}" in shown
+        assert f"{limit:.3f}" in page
+        for text in (page, screen):
+            assert f"{error / limit:.2f}" in text
         # The best comes first.
         assert page.index("| MPC") < page.index("| NN (1992)") < page.index("| PI (1992)")
         assert "6 settings by the search of version 0.1" in page
@@ -217,13 +200,12 @@ class TestCompare:
     @pytest.mark.usefixtures("undrawn")
     def test_a_row_of_the_presets_is_what_evaluate_says(self, compared):
         out = compared("--presets --runs 2 --scenarios randomised --agents nn self-tuning")
-        runs = pd.read_csv(out / "runs.csv").set_index("agent")
+        rows = pd.read_csv(out / "runs.csv").set_index("agent")
         estimates = pd.read_csv(out / "estimates.csv").set_index("agent")
         for agent in estimates.index:
-            member = ROSTER[agent].members()[0]
-            controller = member.make(PRESETS["randomised"], 2, SEED)
-            found = evaluate(controller, IDS["randomised"], episodes=2, **member.observation)
-            row, against = runs.loc[agent], estimates.loc[agent]
+            controller, _ = ROSTER[agent].start(PRESETS["randomised"], 2, SEED)
+            found = evaluate(controller, IDS["randomised"], episodes=2)
+            row, against = rows.loc[agent], estimates.loc[agent]
             assert list(row["seed"]) == list(found.seeds)
             np.testing.assert_allclose(row["mae"], found.errors, rtol=0, atol=1e-12)
             np.testing.assert_allclose(row["total_variation"], found.travels, atol=1e-9)
@@ -242,24 +224,24 @@ class TestCompare:
         bad = "--agent bad=my_controllers:Mine --agent worse=my_controllers:PIController.x"
         given = f"--agents --agent {option} {bad} --scenarios constant --runs 1"
         out = compared(given, status=1)
-        runs = pd.read_csv(out / "runs.csv")
-        assert runs["mae"].tolist() == pytest.approx([0.283], abs=0.001)  # that of the gains
+        errors = pd.read_csv(out / "runs.csv")["mae"].tolist()
+        assert errors == pytest.approx([0.283], abs=0.001)  # that of the gains
         said = capsys.readouterr().err
         assert "2 of 4 tasks are missing" in said
         assert "bad, constant: " in said
-        assert "--agent: 'bad=my_controllers:Mine' cannot be loaded: the module" in said
+        assert "module 'my_controllers' has no attribute 'Mine'" in said
         assert "**Unfinished: 2 of 4 tasks are missing.**" in (out / "report.md").read_text()
 
     @pytest.mark.usefixtures("undrawn")
     def test_cases_not_finished_are_left_out_and_one_run_has_no_interval(
         self, compared, monkeypatch
     ):
-        def run_case(scenario, *given, run=comparison.run_case):
+        def with_a_fault(scenario, *given):
             if scenario.name == "square":
                 raise ArithmeticError("a fault")
-            return run(scenario, *given)
+            return run_case(scenario, *given)
 
-        monkeypatch.setattr(comparison, "run_case", run_case)
+        monkeypatch.setattr(runs, "run_case", with_a_fault)
         out = compared("--agents pi nn --scenarios square constant --runs 1", status=1)
         estimates = pd.read_csv(out / "estimates.csv").set_index("agent")
         assert estimates["scenario"].tolist() == ["constant"] * 2
@@ -284,14 +266,13 @@ class TestCompare:
     def test_after_an_interruption_there_is_a_report_on_what_has_finished(
         self, compared, monkeypatch, capsys
     ):
-        run = comparison.run_case
-        once = Mock(side_effect=[run(SCENARIOS["load"], ROSTER["pi"], 1, 0), KeyboardInterrupt])
-        monkeypatch.setattr(comparison, "run_case", once)
+        result = run_case(SCENARIOS["load"], ROSTER["pi"], 1, 0)
+        monkeypatch.setattr(runs, "run_case", Mock(side_effect=[result, KeyboardInterrupt]))
         out = compared("--agents pi --scenarios constant load --runs 1", status=130)
         said = "interrupted: 1 of 4 tasks are missing"
         assert f"**Unfinished: {said}.**" in (out / "report.md").read_text()
         printed = capsys.readouterr()
-        assert f"data and plots are in {out}/" in printed.out
+        assert f"data and pictures are in {out}/" in printed.out
         assert said in printed.err
 
     def test_a_controller_may_have_any_name(self, compared):
@@ -314,54 +295,47 @@ class TestCompare:
         assert pd.read_csv(folder / "runs.csv")["saturation_share"].isna().all()
 
     @pytest.mark.usefixtures("undrawn")
-    def test_controllers_made_for_another_plant_are_marked_and_not_ranked(
-        self, compared, tmp_path, capsys
+    def test_controllers_made_for_the_other_sign_are_left_out(
+        self, compared, tmp_path, capsys, refused
     ):
         plant = tmp_path / "plant.json"
         plant.write_text(json.dumps(RISING))
-        agents = "pi pi-simc dahlin ppo nn idle"
-        out = compared(f"--plant {plant} --scenarios square --agents {agents} --runs 1")
-        page, screen = (out / "report.md").read_text(), capsys.readouterr().out
-        for text in (page, " ".join(screen.split())):  # lines are wrapped on the screen
-            assert "PI (1992) was made for a plant of negative gain" in text
-            assert "so the loop runs in positive feedback" in text
-            # NN (1992) knows the direction, but its gains are for a plant eight times as slow.
-            assert "NN (1992) was made for another plant: the time constant is 2.5" in text
-        rows = [line.split("|")[1:3] for line in page.splitlines() if line.startswith("| ")]
-        scores = {name.strip(): score.strip() for name, score in reversed(rows)}
-        for name in ("PI (1992) †", "PPO †", "NN (1992) †"):
-            assert scores[name] == "not ranked"
-        for name in ("PI (SIMC)", "Dahlin"):
-            assert float(scores[name]) > 0.9
-        assert scores["idle valve"] == "0.000"
-        # They stand below the worst that counts, though not all of them are worse.
-        assert page.index("| idle valve") < page.index("| NN (1992) †")
+        words = f"--plant {plant} --scenarios square --runs 1"
+        out = compared(f"{words} --agents pi pi-simc dahlin ppo nn idle")
+        sentence = "Left out, because made for a gain of the other sign: PI (1992), PPO."
+        assert sentence in (out / "report.md").read_text()
+        assert sentence in capsys.readouterr().out
+        scores = pd.read_csv(out / "estimates.csv").set_index("agent")["ratio"]
+        assert [*scores.index] == ["pi-simc", "dahlin", "nn", "idle"]
+        assert scores["dahlin"] < scores["pi-simc"] < 2.0
+        assert "name at least one controller" in refused(
+            main, [*words.split(), "--agents", "pi"]
+        )
 
-    def test_on_the_plants_that_it_was_made_for_nobody_is_marked(self):
-        for preset in PRESETS.values():
-            plant = Parameters(**preset)
-            assert comparison.misfits_of(ROSTER, [plant]) == {}
-        slow = Parameters(delay=40)  # 41 samples in place of 19
-        assert set(comparison.misfits_of(ROSTER, [slow])) == {
-            "nn", "pi", "pi-searched", "ppo", "ppo-hard",
-        }  # fmt: skip
+    @pytest.mark.parametrize(
+        ("cases", "headings"),
+        [
+            ("", "score square zone 7 noise const zone 7 noise load (t/h)"),
+            ("--presets", "score paper zone 7 noisy disturb. fouling random. hard (t/h)"),
+        ],
+    )
+    @pytest.mark.usefixtures("undrawn")
+    def test_the_screen_has_one_narrow_table(self, cases, headings, compared, capsys):
+        long = f"{30 * 'x'}=agents:PIController"
+        compared(f"{cases} --agents pi-searched idle --runs 1 --agent {long}")
+        *lines, _ = capsys.readouterr().out.splitlines()  # the last names the folder
+        assert max(map(len, lines)) <= 80
+        assert lines[1].split() == ["controller", *headings.split()]
+        assert len(lines) == 2 + 3 + 1
 
     def test_few_controllers_are_all_pictured_and_of_many_the_chosen_ones(self):
-        def pictured(names, misfits=()):
-            scores, reasons = dict.fromkeys(names), dict.fromkeys(misfits)
-            return a_comparison(scores=scores, misfits=reasons).pictured
+        few = ["mpc", "nn", "mine"]
+        assert report.pictured(few) == few
+        chosen = {"nn", "pi", "dahlin", "ppo", "mine"}
+        assert set(report.pictured([*ROSTER, "mine"])) == chosen
 
-        few = ["mpc", "nn", "self-tuning"]
-        assert pictured(few) == few
-        assert pictured(few, ["nn"]) == ["mpc", "self-tuning"]
-        assert pictured(few, few) == few
-        chosen = {"nn", "pi", "dahlin", "ppo"}
-        assert set(pictured(list(ROSTER))) == chosen
-        assert set(pictured(list(ROSTER), ["pi"])) == chosen - {"pi"}
-
-    def test_the_costs_have_the_robustness_of_the_linear_controllers(self):
-        specs = {name: ROSTER[name] for name in ("pi", "pi-simc", "smith", "dahlin", "mpc")}
-        table = report.costs_table([], specs, SCENARIOS["square"])
-        assert table["Ms"].tolist() == ["unstable", "1.60", "1.60", "1.60", ""]
-        delays = table["stable with delays of (samples)"].tolist()
-        assert delays == ["none", "0 to 56", "0 to 52", "0 to 54", ""]
+    def test_linear_controllers_have_a_maximum_sensitivity(self):
+        agents = "pi", "pi-simc", "smith", "dahlin", "mpc"
+        results = [run_case(SCENARIOS["square"], ROSTER[name], 1, 0) for name in agents]
+        texts = [report.sensitivity_text(result.sensitivity) for result in results]
+        assert texts == ["unstable", "1.60", "1.60", "1.60", ""]

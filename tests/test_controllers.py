@@ -4,17 +4,18 @@ import copy
 import pickle
 import re
 
+import gymnasium
 import numpy as np
 import pytest
+from stable_baselines3 import PPO
 
-from benchmarks.compare.comparison import run_case
-from benchmarks.controllers.options import chosen
+from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import CommandError
-from benchmarks.loop.rollout import make_plants, mean_error
-from benchmarks.loop.scenarios import Scenario
+from benchmarks.loop.rollout import make_plants, mean_error, rollout
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
+from tests.conftest import ROOT
 from tests.verify_bounds import errors
 
 ACTUATOR = {"u_min": -9.0, "u_max": 14.0, "dead_zone": 4.0}
@@ -33,41 +34,46 @@ def member(entry):
     return entry.members()[0]
 
 
+def run_again(agent, plant, samples, runs, seed):
+    """Run a controller that may have run before."""
+    return rollout(make_plants(runs, samples, **plant), agent, samples, seed)
+
+
 def test_each_controller_controls_another_plant(entry, member):
     assert entry.knows
     assert entry.searched
-    plant = ACTUATOR if "direction" in entry.assumes else OTHER
-    case = Scenario("other", "", 600, plant)
-    run_errors = run_case(case, member, 2, SEED).runs["mae"].to_numpy()
+    plant = ACTUATOR if entry.direction else OTHER
+    run_errors = errors(member, 2, 600, **plant)
     if entry.name == "idle":
         np.testing.assert_allclose(run_errors, IDLE)
         return
     assert (run_errors < 0.7 * IDLE).all()
     if member.learns:  # A controller in service has learnt on this plant before.
-        learnt = member.run(plant, 600, 2, SEED, member.in_service(plant, 2, SEED))
+        agent = member.in_service(plant, 2, SEED)
+        learnt = run_again(agent, plant, 600, 2, SEED)
         assert mean_error(learnt).mean() < 0.9 * run_errors.mean()
 
 
 def test_a_batch_is_its_members_again_and_mirrored(entry, member):
-    def run(runs, seed, sign=1.0, controller=None):
+    def start(runs, seed, sign=1.0):
         # Plants with a limit that is nearer on one side, and set points beyond it.
         limits = {"u_min": -6.0, "u_max": 10.0} if sign > 0 else {"u_min": -10.0, "u_max": 6.0}
         plant = {**limits, "b": [sign * b for b in Parameters().b], "noise_variance": 0.1}
-        controller = controller or member.make(plant, runs, seed)
+        agent, plant = member.start(plant, runs, seed)
         plant |= {"setpoint_amplitude": 6.0, "setpoint_period": 200}
-        return controller, member.run(plant, 160, runs, seed, controller)
+        return agent, plant, 160, runs, seed
 
-    controller, batch = run(3, 5)
+    three = start(3, 5)
+    batch = run_again(*three)
     # Matrix products differ in their last digit by the number of rows.
-    alone = run(1, 5 + 2)[1].command[:, 0]
+    alone = run_again(*start(1, 7)).command[:, 0]
     np.testing.assert_allclose(alone, batch.command[:, 2], atol=1e-3)
     # An episode leaves nothing behind but what is learnt.
-    again = run(3, 5, controller=controller)[1]
-    assert np.array_equal(again.command, batch.command) is not member.learns
+    assert np.array_equal(run_again(*three).command, batch.command) is not member.learns
     # Some were made for plants of one direction; initial weights are random.
-    if "direction" in entry.assumes or entry.random:
+    if entry.direction or entry.random:
         return
-    _, mirrored = run(3, 5, sign=-1.0)
+    mirrored = run_again(*start(3, 5, sign=-1.0))
     # Actions have 24 bits, which limits the agreement.
     np.testing.assert_allclose(mirrored.command, -batch.command, atol=1e-2)
     if entry.name != "idle":
@@ -76,9 +82,8 @@ def test_a_batch_is_its_members_again_and_mirrored(entry, member):
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda a: pickle.loads(pickle.dumps(a))])
 def test_a_copy_in_mid_episode_goes_on_like_the_original(member, copied):
-    plant = {**PRESETS["hard"], **member.observation}
-    plants = make_plants(3, 80, **plant)
-    controller = member.make(PRESETS["hard"], 3, 5)
+    controller, arguments = member.start(PRESETS["hard"], 3, 5)
+    plants = make_plants(3, 80, **arguments)
     observations, _ = plants.reset(seed=5)
     for k in range(80):
         if k == 40:
@@ -107,82 +112,70 @@ def written(tmp_path, monkeypatch):
 
 
 def members_of(*locations):
-    return chosen([], [f"mine={location}" for location in locations])["mine"].members()
+    return own_controllers([f"mine={location}" for location in locations])["mine"].members()
 
 
 class TestOwnControllers:
-    """What is no controller is named by the tasks that need it."""
-
     def test_a_factory_gets_what_it_asks_for(self, written):
         code = (
             "class Mine:\n"
-            "    def __init__(self, {}): self.given = {}\n"
+            "    def __init__(self, num_envs, seed, parameters, u_max, gain=2):\n"
+            "        self.given = locals()\n"
             "    reset = dict\n"
             "    act = lambda self, o: 0.0 * o[:, :1]\n"
         )
-        named = code.format("num_envs, seed, parameters, gain=2", "locals()")
-        (some,) = members_of(written(named))
-        given = some.make({"delay": 3}, 3, 7).given
+        (member,) = members_of(written(code))
+        given = member.start({"delay": 3, "u_max": 9.0}, 3, 7)[0].given
         assert (given["num_envs"], given["seed"], given["gain"]) == (3, 7, 2)
-        assert given["parameters"].delay == 3
-        (everything,) = members_of(written(code.format("**offered", "offered")))
-        assert set(everything.make({}, 3, 7).given) == {
-            "num_envs", "seed", "u_min", "u_max", "parameters",
-        }  # fmt: skip
+        assert (given["parameters"].delay, given["u_max"]) == (3, 9.0)
 
-    @pytest.mark.parametrize("location", ["agents", "agents:No", "nowhere:x", ".:y", "..a:y"])
+    @pytest.mark.parametrize("location", ["agents", "nowhere:x", "none.npz", "none.json", ""])
     def test_bad_locations(self, location):
-        with pytest.raises(CommandError, match=f"--agent: .*{re.escape(location)}' "):
+        with pytest.raises(CommandError, match=f"--agent: .*mine={location}.* must "):
             members_of(location)
 
-    @pytest.mark.parametrize(
-        ("code", "complaint"),
-        [
-            ("def Mine(:", "--agent: .* cannot be loaded: SyntaxError"),
-            ("raise SystemExit(3)", "--agent: .* cannot be loaded: SystemExit: 3"),
-            ("class Mine: pass", "policy must be a function, or an object with pre"),
-            ("class Mine: observation = 3", "cannot be loaded: .* a dict .* got 3"),
-            ("class Mine: observation = {'delay': 0}", "with keys from .* got {'delay': 0}"),
-            (
-                "class Mine: reset = dict; act = lambda self, o: 0.0",
-                r"policy must return finite actions, shape \(2, 1\), got .*, shape \(\)",
-            ),
-            (
-                "class Mine: reset = dict; act = lambda self, o: o[:, :1] + float('nan')",
-                r"mine=own_\d+:Mine' cannot be run: policy must return finite .*, got",
-            ),
-            (
-                "class Mine: reset = dict; act = lambda self, o: 1 / 0",
-                r"mine=.* cannot be run: ZeroDivisionError: [^\n]+\n\nTraceback",
-            ),
-            ("Mine = 3", r"mine=.* cannot be loaded: 'Mine' must be a function or a class"),
-            ("Yours = 3", r"mine=.* cannot be loaded: the module '\w+' has no 'Mine'"),
-            ("def Mine(): return 1 / 0", r"mine=.* cannot be made: ZeroDivisionError"),
-            (
-                "class Mine: __init__ = lambda self, gain: None",
-                r"mine=.* cannot be made: .*argument: 'gain': a factory gets only \w+",
-            ),
-        ],
-    )
-    def test_bad_ones(self, code, complaint, written):
-        with pytest.raises(CommandError, match=complaint) as error:
-            members_of(written(code))[0].run({"delay": 3}, 2, 2, 0)
-        # A traceback follows where the user's code has failed.
-        has_traceback = "Traceback" in str(error.value)
-        assert has_traceback == bool(re.search("Error: |SystemExit: ", str(error.value)))
+    @pytest.mark.parametrize("name", ["", "pi", "PI"])
+    def test_bad_names(self, name):
+        with pytest.raises(
+            CommandError, match=f"--agent: '{name}=agents:PIController' must have"
+        ):
+            own_controllers([f"{name}=agents:PIController"])
 
     def test_the_same_name_again_is_another_training(self, written):
         other = written("from agents import PIController as Mine")
         members = members_of("agents:PIController", other)
-        files = [member.provenance["file"] for member in members]
-        assert files == ["agents:PIController", other]
-        assert errors(members[0], 1, 60, setpoint_window=7) == errors(members[0], 1, 60)
+        assert len(members) == 2
+        assert errors(members[1], 1, 60) == errors(ROSTER["pi"], 1, 60)
 
+    def test_a_factory_names_the_environment_of_its_policy(self, written):
+        code = (
+            "def Mine():\n"
+            "    return (lambda seen: -0.1 * seen[:, 5:6]), {'action_window': 20,\n"
+            "        'setpoint_window': 5}\n"
+        )
+        (member,) = members_of(written(code))
+        expected = evaluate(
+            lambda seen: -0.1 * seen[:, 5:6], IDS["noisy"], episodes=3,
+            setpoint_window=5, action_window=20,
+        )  # fmt: skip
+        np.testing.assert_allclose(
+            errors(member, 3, 1200, **PRESETS["noisy"]), expected.errors, rtol=0, atol=1e-12
+        )
 
-def test_a_function_gives_the_policy_and_what_it_observes(written):
-    code = "def Mine(): return lambda seen: -0.1 * seen[:, :1], {'setpoint_window': 0}\n"
-    (member,) = members_of(written(code))
-    found = errors(member, 3, 100, **PRESETS["noisy"])
-    plant = {"max_episode_steps": 100, "setpoint_window": 0}
-    expected = evaluate(lambda seen: -0.1 * seen[:, :1], IDS["noisy"], episodes=3, **plant)
-    np.testing.assert_allclose(found, expected.errors, rtol=0, atol=1e-9)
+    def test_a_zip_of_stable_baselines3_enters_by_the_lines_of_the_page(
+        self, written, tmp_path, monkeypatch
+    ):
+        windows = {"error_window": 8, "action_window": 30}
+        env = gymnasium.make("MiddlePoint-v0", **windows)
+        model = PPO("MlpPolicy", env, seed=0, device="cpu")
+        model.save(tmp_path / "model.zip")
+        page = (ROOT / "benchmarks/examples/train_your_own.md").read_text(encoding="utf-8")
+        (code,) = re.findall(
+            r"```python\n(from stable_baselines3 import PPO\n\n\ndef.*?)```", page, re.DOTALL
+        )
+        monkeypatch.chdir(tmp_path)
+        (member,) = members_of(written(code.replace("def ppo", "def Mine")))
+        expected = evaluate(model, IDS["noisy"], episodes=3, **windows)
+        np.testing.assert_allclose(
+            errors(member, 3, 1200, **PRESETS["noisy"]), expected.errors, rtol=0, atol=1e-9
+        )

@@ -9,7 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from benchmarks.compare import plots
-from benchmarks.controllers.roster import looks
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.pictures import STYLE
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
@@ -21,17 +21,15 @@ def ticks(axis):
 
 class TestFindings:
     def test_of_scores(self):
-        scores = {"mpc": 0.998, "smith": 0.9971, "mine": 0.9, "pi": -0.0001}
-        estimates = {agent: Estimate(x, x, x, 1) for agent, x in scores.items()}
-        assert plots.scores_finding(estimates) == (
+        scores = {"MPC": 0.998, "Smith": 0.9971, "mine": 0.9, "PI (1992)": -0.0001}
+        assert plots.scores_finding(scores) == (
             "MPC has the highest score (0.998), Smith the second highest (0.997), "
             "and PI (1992) the lowest (0.000)"
         )
-        assert plots.scores_finding({"mine": estimates["mine"]}) == "mine has a score of 0.900"
+        assert plots.scores_finding({"mine": 0.9}) == "mine has a score of 0.900"
 
     def test_of_responses(self):
-        errors = pd.Series({"mpc": 0.5, "nn": 1.0, "pi": 1.27})
-        finding = plots.responses_finding(errors)
+        finding = plots.responses_finding({"MPC": 0.5, "NN (1992)": 1.0, "PI (1992)": 1.27})
         assert finding == "PI (1992) has 2.5 times the mean error of MPC"
 
 
@@ -60,7 +58,7 @@ def test_scores_beyond_the_axis_stand_at_its_ends(figures, tmp_path):
     ]
     means = {agent: np.mean(scores) for agent, scores in values.items()}
     scores = {agent: Estimate(mean, mean, mean, 2) for agent, mean in means.items()}
-    plots.plot_scores(scores, pd.DataFrame(rows), tmp_path / "scores.png")
+    plots.plot_scores(scores, pd.DataFrame(rows), ROSTER, tmp_path / "scores.png")
     (axes,) = figures[0].axes
     labels = ticks(axes.xaxis)
     assert (labels[0], labels[-1]) == ("≤ -0.5", "≥ 0.999")
@@ -87,10 +85,12 @@ class TestResponses:
     def test_the_first_run_is_shown_in_whole_and_as_a_temperature(self, figures, tmp_path):
         rows = pd.concat([responses("pi", [3.0, 7.0]), responses("smith", [5.0])])
         errors = pd.Series({"pi": 2.0, "smith": 1.0})
-        plots.plot_responses(rows, errors, SCENARIOS["constant"], tmp_path / "constant.png")
+        case = SCENARIOS["constant"]
+        plots.plot_responses(rows, errors, case, ROSTER, tmp_path / "constant.png")
         smith, _, pi, flow = figures[0].axes
         assert smith.get_title(loc="left") == "Smith: mean error 1.000 °C"
-        (run,) = [line for line in pi.get_lines() if line.get_color() == looks(["pi"])["pi"][0]]
+        colour, _ = ROSTER["pi"].look
+        (run,) = [line for line in pi.get_lines() if line.get_color() == colour]
         np.testing.assert_array_equal(run.get_ydata()[-2:], [3.0, 7.0])
         low, high = pi.get_ylim()
         assert low < 3.0 < 7.0 < high
@@ -117,6 +117,7 @@ class TestResponses:
     def test_the_legend_names_what_is_there(self, spread, plant, texts, figures, tmp_path):
         rows = responses("pi", [5.0], spread)
         case = Scenario("case", "a case", 600, plant)
-        plots.plot_responses(rows, pd.Series({"pi": 1.0}), case, tmp_path / "case.png")
+        errors = pd.Series({"pi": 1.0})
+        plots.plot_responses(rows, errors, case, ROSTER, tmp_path / "case.png")
         (legend,) = figures[0].legends
         assert [text.get_text() for text in legend.get_texts()] == texts

@@ -7,9 +7,11 @@ import re
 
 import pytest
 
+from agents import PolicyNetwork
+from agents.networks import PRETRAINED
 from benchmarks import datasets, tune
 from benchmarks.claims.runs import Batch
-from benchmarks.controllers import roster, spec
+from benchmarks.controllers import roster
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.train import __main__ as train
 from mptc_gym import evaluation
@@ -38,7 +40,7 @@ def test_every_command_stays_in_its_block():
         "studies": [Batch(1000).seed + 1000 - 1],
         "networks": [train.SEED, train.SEED + 5 - 1],
         "sampler": [tune.SEED, tune.SEED + 800 - 1],
-        "preparation": [*trials, trials[-1] + 100 - 1, spec.COMMISSIONING_SEED + 1000 - 1],
+        "preparation": [*trials, trials[-1] + 100 - 1, roster.COMMISSIONING_SEED + 1000 - 1],
         "finals": [*finals, finals[-1] + tune.FINAL_RUNS - 1],
         "validation": [evaluation.VALIDATION_SEED],
         "published": [evaluation.SEED, evaluation.SEED + 1000 - 1],
@@ -89,5 +91,6 @@ def test_published_files_have_the_seeds_of_the_table():
 
 @pytest.mark.parametrize("controller", ["ppo", "ppo-hard"])
 def test_trained_networks_have_the_seeds_of_the_table(controller):
-    for member in roster.ROSTER[controller].members():
-        assert block_of(member.provenance["seed"]) == "networks"
+    for file in roster.ROSTER[controller].trainings:
+        provenance = PolicyNetwork.load(PRETRAINED / file).provenance
+        assert block_of(provenance["seed"]) == "networks"

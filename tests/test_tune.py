@@ -10,9 +10,9 @@ import pytest
 from agents import DirectNNController
 from agents.pi import SEARCHED_GAINS
 from benchmarks import tune
-from benchmarks.controllers.options import chosen
-from benchmarks.controllers.plant_scale import NN_SPANS, PI_SPANS
+from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.spans import NN_SPANS, PI_SPANS
 from benchmarks.lib.command import CommandError
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import Parameters
@@ -106,17 +106,13 @@ def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path):
     file = tmp_path / "pi/gains.json"
     gains = json.loads(file.read_text())["gains"]
     assert gains["kp"] < 0.0
-    (spec,) = chosen([], [f"mine={file}"]).values()
-    rising, falling = (Parameters(b=b) for b in ([0.0456, 0.00404], [-0.0456, -0.00404]))
-    assert spec.misfit(rising) == ""
-    assert "positive feedback" in spec.misfit(falling)
-    controller = spec.make({"b": [0.0456, 0.00404]}, 1, 0)
+    (spec,) = own_controllers([f"mine={file}"]).values()
+    assert spec.direction == 1
+    controller, _ = spec.start({"b": [0.0456, 0.00404]}, 1, 0)
     assert (controller.kp, controller.ki) == (gains["kp"], gains["ki"])
-    with pytest.raises(CommandError, match=r"'mine' must be one gains\.json or several \.npz"):
-        chosen([], [f"mine={file}"] * 2)
     file.write_text('{"controller": "pi"}')
-    with pytest.raises(CommandError, match=r"--agent: mine=.* must be a gains\.json"):
-        chosen([], [f"mine={file}"])
+    with pytest.raises(CommandError, match=r"--agent: mine=.* must be .*: 'gains'"):
+        own_controllers([f"mine={file}"])
 
 
 @pytest.mark.usefixtures("short")

@@ -8,11 +8,9 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.bounds.least import least_possible
-from benchmarks.controllers.roster import ROSTER
-from benchmarks.controllers.spec import EVERYTHING, ControllerSpec
+from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.report import on_screen
 from benchmarks.lib.statistics import student
-from benchmarks.loop.linear import nominal
 from benchmarks.loop.rollout import mean_error
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import PRESETS
@@ -50,10 +48,10 @@ class Counting:
     is the delay. If the set point is no square wave, the flow holds the present set point.
     """
 
-    def __init__(self, parameters, **_):
-        self.plant = parameters
-        self.gain = nominal(parameters).gain
-        self.limits = [np.mean(parameters.range_of(name)) for name in ("u_min", "u_max")]
+    def __init__(self, plant, runs, seed):
+        self.plant = plant.parameters
+        self.gain = plant.gain
+        self.limits = [np.mean(self.plant.range_of(name)) for name in ("u_min", "u_max")]
 
     def reset(self):
         self.k = self.plant.range_of("delay")[0] + 10
@@ -68,13 +66,7 @@ class Counting:
         return action_from_command(level / self.gain, *self.limits)
 
 
-COUNTING = ControllerSpec(
-    name="counting",
-    label="counting",
-    look=("", ""),
-    build=Counting,
-    prior_knowledge=EVERYTHING,
-)
+COUNTING = ControllerSpec(name="counting", label="counting", look=("", ""), make=Counting)
 CONTROLLERS = {name: spec.members()[0] for name, spec in ROSTER.items()}
 CONTROLLERS["counting"] = COUNTING
 

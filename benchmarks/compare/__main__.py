@@ -1,11 +1,13 @@
 """Compare controllers in the same noise: `python -m benchmarks.compare --help`."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Annotated, Any
 
-from benchmarks.controllers.options import AgentNames, ControllerOptions, chosen
-from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.known_plant import KnownPlant
+from benchmarks.controllers.own import own_controllers
+from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.command import (
     CommandError,
     Count,
@@ -17,6 +19,7 @@ from benchmarks.lib.command import (
     known,
     options,
 )
+from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.outputs import new_folder, provenance_of
 from benchmarks.loop.scenarios import (
     PRESET_SCENARIOS,
@@ -25,6 +28,7 @@ from benchmarks.loop.scenarios import (
     PlantOptions,
     Scenario,
 )
+from mptc_gym import Parameters
 from mptc_gym.evaluation import SEED
 
 _SCENARIOS_HELP = (
@@ -39,8 +43,13 @@ _SCENARIOS_HELP = (
 class Options:
     """Run controllers on the same cases in the same noise, and write a report."""
 
-    agents: AgentNames = tuple(name for name, spec in ROSTER.items() if spec.compared)
-    controllers: ControllerOptions = field(default_factory=ControllerOptions)
+    agents: Annotated[
+        Names, Parameter(help=f"The controllers to run, from {', '.join(ROSTER)}.")
+    ] = tuple(name for name, spec in ROSTER.items() if spec.compared)
+    agent: Names = ()
+    """A controller of your own, which runs in addition to those of --agents. Its form is
+    NAME=MODULE:FACTORY; NAME=gains.json for a file of benchmarks.tune; or NAME=FILE.npz for a
+    file of benchmarks.train. The same name again adds another training of the controller."""
     scenarios: Annotated[Names | None, Parameter(help=_SCENARIOS_HELP)] = None
     plant: PlantOptions = field(default_factory=PlantOptions)
     presets: bool = False
@@ -49,53 +58,56 @@ class Options:
     """The number of runs of each controller in each case."""
     seed: Seed = SEED
     """The seed of the first run (default: the seed of the first published episode)."""
+    fan_out: FanOut = field(default_factory=FanOut)
     out: Folder = None
 
 
 def work(options: Options) -> None:
-    """Compare controllers, write the results, and print the main tables.
+    """Compare controllers, write the results, and print a table and the path of the report.
 
     If a task fails or the user interrupts the comparison, the results of all finished tasks are
     written before an error is raised.
     """
-    from benchmarks.compare.comparison import run_case, scale_of
     from benchmarks.compare.report import write
+    from benchmarks.compare.runs import least_error, run_case
 
-    controllers = chosen(options.agents, options.controllers.agent)
+    names = known("--agents", options.agents, ROSTER)
+    chosen = {name: ROSTER[name] for name in names} | own_controllers(options.agent)
+    controllers, note = that_fit(chosen, options.plant)
     folder_name, scenarios = cases(options)
     provenance = provenance_of(
         options={**asdict(options), "agents": list(controllers)},
         seeds=list(range(options.seed, options.seed + options.runs)),
-        scenarios={scenario.name: vars(scenario) for scenario in scenarios},
+        scenarios={name: vars(scenario) for name, scenario in scenarios.items()},
     )
     folder = new_folder(options.out, folder_name, provenance)
     # Names of tasks are, for example, "bounds of square" and "mpc, square".
     bound_tasks: dict[str, Any] = {}
     run_tasks: dict[str, Any] = {}
-    for scenario in scenarios:
-        bound_task = partial(scale_of, scenario, options.runs, options.seed)
+    for scenario in scenarios.values():
+        bound_task = partial(least_error, scenario, options.runs, options.seed)
         bound_tasks[f"bounds of {scenario.name}"] = bound_task
     for name, controller in controllers.items():
-        for scenario in scenarios:
+        for scenario in scenarios.values():
             run_task = partial(run_case, scenario, controller, options.runs, options.seed)
             run_tasks[f"{name}, {scenario.name}"] = run_task
     tasks = bound_tasks | run_tasks
     # Long tasks start first, so that no core waits long at the end. The first argument of each
     # task is a scenario.
-    names = sorted(tasks, key=lambda name: -tasks[name].args[0].samples)
-    sorted_tasks = {name: tasks[name] for name in names}
-    finished = options.controllers.fan_out.run(sorted_tasks, "compare")
+    task_names = sorted(tasks, key=lambda name: -tasks[name].args[0].samples)
+    sorted_tasks = {name: tasks[name] for name in task_names}
+    finished = options.fan_out.run(sorted_tasks, "compare")
     results = [finished.results[name] for name in run_tasks if name in finished.results]
-    scales = [finished.results[name] for name in bound_tasks if name in finished.results]
+    bounds = [finished.results[name] for name in bound_tasks if name in finished.results]
     if results:
-        write(results, scales, controllers, folder, provenance, finished.error)
-        print(f"The report, tables, data and plots are in {folder}/")
+        table = write(results, bounds, controllers, folder, provenance, note, finished.error)
+        print(f"{table}\nThe report, tables, data and pictures are in {folder}/")
     if finished.error:
         raise finished.error
 
 
-def cases(options: Options) -> tuple[str, list[Scenario]]:
-    """Return the name of the default output folder in `results/`, and the scenarios to run.
+def cases(options: Options) -> tuple[str, dict[str, Scenario]]:
+    """Return the name of the default output folder in `results/`, and the scenarios by name.
 
     A `CommandError` is raised if `options` has options that exclude each other, or the name of
     an unknown scenario.
@@ -109,10 +121,28 @@ def cases(options: Options) -> tuple[str, list[Scenario]]:
     else:
         folder_name, available = "compare", SCENARIOS
     wanted = list(available) if options.scenarios is None else options.scenarios
-    scenarios = [available[name] for name in known("--scenarios", wanted, available)]
+    scenarios = {name: available[name] for name in known("--scenarios", wanted, available)}
     if not scenarios:
         raise CommandError("--scenarios: name at least one case")
     return folder_name, scenarios
+
+
+def that_fit(
+    controllers: Mapping[str, ControllerSpec], plant: PlantOptions
+) -> tuple[dict[str, ControllerSpec], str]:
+    """Return the controllers that fit the sign of the plant's gain, and a sentence on others.
+
+    A `CommandError` is raised if no controller is left.
+    """
+    allowed = None, KnownPlant(Parameters(**plant.arguments())).direction
+    fitting = {name: spec for name, spec in controllers.items() if spec.direction in allowed}
+    labels = [spec.label for name, spec in controllers.items() if name not in fitting]
+    note = ""
+    if labels:
+        note = f"Left out, because made for a gain of the other sign: {', '.join(labels)}."
+    if not fitting:
+        raise CommandError(f"--agents, --agent: name at least one controller. {note}")
+    return fitting, note
 
 
 main = command("compare", Options, work)

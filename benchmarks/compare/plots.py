@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullLocator
 from numpy.typing import ArrayLike, NDArray
 
-from benchmarks.controllers.roster import label, looks
+from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.pictures import AT_LEAST, AT_MOST, DEAD_ZONE, LIMIT, SETPOINT, open_picture
 from benchmarks.lib.statistics import Estimate, as_text
 from benchmarks.loop.scenarios import Scenario
@@ -37,7 +37,12 @@ SCORE_LABEL = (
 BAND: Any = {"alpha": 0.3, "linewidth": 0}
 
 
-def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: Path) -> None:
+def plot_scores(
+    scores: Mapping[str, Estimate],
+    estimates: pd.DataFrame,
+    controllers: Mapping[str, ControllerSpec],
+    path: Path,
+) -> None:
     """Draw the scores of controllers: a row for each controller, on a common axis of scores.
 
     Each row has a large marker at the overall score of the controller, and a small tick at the
@@ -48,17 +53,20 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
     scores : mapping
         Overall score of each controller by name, the highest score first.
     estimates : pandas.DataFrame
-        The table that `comparison.estimate` returns.
+        The table that `estimates.estimate` returns.
+    controllers : mapping
+        Record of each controller by name.
     path : Path
         The PNG file.
     """
-    styles = looks(list(estimates["agent"].unique()))
+    labels = [controllers[agent].label for agent in scores]
     drawn_scores = [score.value for score in scores.values()]
     height = 1.5 + 0.3 * len(scores)  # inches: title and axis, and the rows
-    with open_picture(path, height, scores_finding(scores)) as figure:
+    finding = scores_finding(dict(zip(labels, drawn_scores, strict=True)))
+    with open_picture(path, height, finding) as figure:
         axes = figure.subplots()
         for row, (agent, score) in enumerate(scores.items()):
-            colour, marker = styles[agent]
+            colour, marker = controllers[agent].look
             scores_of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
             scenario_scores = [float(np.mean(values)) for values in scores_of_runs]
             drawn_scores += scenario_scores
@@ -69,7 +77,7 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
             right_of_axes = (1.01, row)
             text = as_text(score.value, ".3f")
             axes.annotate(text, right_of_axes, xycoords=("axes fraction", "data"), va="center")
-        axes.set_yticks(range(len(scores)), [label(agent) for agent in scores])
+        axes.set_yticks(range(len(scores)), labels)
         axes.set_ylim(len(scores) - 0.5, -0.5)  # The first controller has the top row.
         scale_by_score(axes, drawn_scores)
         caption = SCORE_LABEL
@@ -78,10 +86,13 @@ def plot_scores(scores: Mapping[str, Estimate], estimates: pd.DataFrame, path: P
         axes.set_xlabel(caption)
 
 
-def scores_finding(scores: Mapping[str, Estimate]) -> str:
-    """Return the title of the picture of scores, which names the highest and lowest scores."""
-    names = [label(agent) for agent in scores]
-    values = [as_text(score.value, ".3f") for score in scores.values()]
+def scores_finding(scores: Mapping[str, float]) -> str:
+    """Return the title of the picture of scores, which names the highest and lowest scores.
+
+    `scores` has the score of each controller by label, the highest score first.
+    """
+    names = list(scores)
+    values = [as_text(score, ".3f") for score in scores.values()]
     if len(scores) == 1:
         return f"{names[0]} has a score of {values[0]}"
     finding = f"{names[0]} has the highest score ({values[0]})"
@@ -122,7 +133,11 @@ def scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
 
 
 def plot_responses(
-    responses: pd.DataFrame, errors: pd.Series[float], scenario: Scenario, path: Path
+    responses: pd.DataFrame,
+    errors: pd.Series[float],
+    scenario: Scenario,
+    controllers: Mapping[str, ControllerSpec],
+    path: Path,
 ) -> None:
     """Draw the temperature and the flow over time, in a row of panels for each controller.
 
@@ -131,26 +146,27 @@ def plot_responses(
     Parameters
     ----------
     responses : pandas.DataFrame
-        The rows of all controllers to draw, from the tables `comparison.Result.responses`.
+        The rows of all controllers to draw, from the tables `runs.Result.responses`.
     errors : pandas.Series
         Mean error of each controller in the scenario, degC, by the name of the controller.
     scenario : Scenario
+    controllers : mapping
+        Record of each controller by name.
     path : Path
         The PNG file.
     """
     errors_drawn = errors[responses["agent"].unique()].sort_values(kind="stable")
     agents = list(errors_drawn.index)
-    # Colours are chosen for all controllers, drawn or not, so that each controller has the same
-    # colour in all pictures.
-    styles = looks(list(errors.index))
-    title = f"{scenario.title}: {responses_finding(errors_drawn)}"
+    by_label = {controllers[agent].label: errors[agent] for agent in agents}
+    title = f"{scenario.title}: {responses_finding(by_label)}"
     height = 1.2 + 1.25 * len(agents)  # inches: title and legend, and the rows
     with open_picture(path, height, title) as figure:
         grid = figure.subplots(len(agents), 2, sharex=True, sharey="col", squeeze=False)
         for (temperature_axes, flow_axes), agent in zip(grid, agents, strict=True):
             rows = responses[responses["agent"] == agent]
-            colour, _ = styles[agent]
-            temperature_axes.set_title(f"{label(agent)}: mean error {errors[agent]:.3f} °C")
+            colour, _ = controllers[agent].look
+            label = controllers[agent].label
+            temperature_axes.set_title(f"{label}: mean error {errors[agent]:.3f} °C")
             _draw_temperature(temperature_axes, rows, colour)
             _draw_flow(flow_axes, rows, colour, scenario.parameters)
         for axes in grid[-1]:
@@ -166,17 +182,17 @@ def plot_responses(
         )
 
 
-def responses_finding(errors: pd.Series[float]) -> str:
+def responses_finding(errors: Mapping[str, float]) -> str:
     """Return a clause of a title that compares the smallest and the largest mean error.
 
-    `errors` has the mean error of each controller, degC, the smallest error first.
+    `errors` has the mean error of each controller by label, degC, the smallest error first.
     """
-    best = str(errors.index[0])
-    worst = str(errors.index[-1])
+    labels = list(errors)
+    best = labels[0]
+    worst = labels[-1]
     if best == worst:
-        return f"the mean error of {label(best)} is {errors[best]:.3f} °C"
-    ratio = errors[worst] / errors[best]
-    return f"{label(worst)} has {ratio:.1f} times the mean error of {label(best)}"
+        return f"the mean error of {best} is {errors[best]:.3f} °C"
+    return f"{worst} has {errors[worst] / errors[best]:.1f} times the mean error of {best}"
 
 
 def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:

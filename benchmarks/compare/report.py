@@ -1,6 +1,7 @@
 """Write the tables, pictures and report of a comparison of controllers in scenarios."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,21 +9,12 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.compare import plots
-from benchmarks.compare.comparison import (
-    Result,
-    Scale,
-    estimate,
-    misfits_of,
-    ranked,
-    summarise,
-    write_numbers,
-)
-from benchmarks.controllers.roster import label
-from benchmarks.controllers.spec import ControllerSpec
+from benchmarks.compare.estimates import estimate, ranked, summarise, write_numbers
+from benchmarks.compare.runs import Bound, Result
+from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.command import CommandError
-from benchmarks.lib.report import Section, show, write_report
+from benchmarks.lib.report import Section, write_report
 from benchmarks.lib.statistics import Estimate, as_text
-from benchmarks.loop.rollout import RESPONSE_SAMPLES, START_SAMPLES
 from benchmarks.loop.scenarios import Scenario
 
 SCORE_TEXT = (
@@ -35,171 +27,135 @@ SCORE_TEXT = (
 )
 RATIO_TEXT = (
     "An error ratio of 1.00 is best. The first row has the least possible error of a "
-    "controller that does not know future set points, and the second row has the least "
-    "possible error of a controller that knows them. The mark * means that the plant settles "
-    "before each change of the set point, and that the error in the first row assumes that "
-    "each change comes as a surprise. In a case with the mark *, a controller that has learnt "
-    "when the set point changes can have an error ratio below 1.00."
-)
-DIFFERENCE_TEXT = (
-    "The reference is the controller that was named first, here {reference}. A cell has the "
-    "error of a controller minus the error of the reference in the same run, in °C: the mean "
-    "over the runs, with a 95 % confidence interval. A negative difference means that the "
-    "controller has the smaller error. The percentage is the share of the runs in which the "
-    "controller has the smaller error."
-)
-PARTS_TEXT = (
-    "The mean error on the preset hard, in °C, is the sum of three contributions: those of the "
-    f"first {START_SAMPLES} samples of a run, of the {RESPONSE_SAMPLES} samples after each "
-    "later change of the set point, and of the remaining samples."
+    "controller that does not know future set points. The mark * means that the plant settles "
+    "before each change of the set point, and that the least possible error assumes that each "
+    "change comes as a surprise. In a case with the mark *, a controller that has learnt when "
+    "the set point changes can have an error ratio below 1.00."
 )
 COSTS_TEXT = (
     "The column 'prior knowledge' says what a controller knows about the plant before a run, "
     "and the column 'searched or trained' says how its settings or weights were found; 1 M "
     "samples are a million samples. Ms is the maximum sensitivity of a control loop, the "
     "largest magnitude of its sensitivity function: the lower Ms is, the more robust is the "
-    "loop. Ms and the range of delays with which the loop is stable are given for linear "
-    "controllers, with the nominal plant of the first case, without dead zone and limits."
+    "loop. Ms is given for linear controllers, with the nominal plant of the first case, "
+    "without dead zone and limits."
 )
 CASES_TEXT = (
     "Each case is the environment MiddlePoint-v0 with the arguments in the last column; all "
     "other arguments have their default values."
 )
-MOST_PICTURED = 8  # largest number of controllers in a picture of responses over time
-MISFIT_MARK = "†"  # marks controllers that were made for another plant
-PARTS_OF_ERROR = {  # names of the parts of the mean error in CSV files and in the report
-    "mae_start": f"first {START_SAMPLES} samples",
-    "mae_changes": f"{RESPONSE_SAMPLES} samples after later changes",
-    "mae_steady": "remaining samples",
-    "mae": "mean error",
-}
+SCREEN_TEXT = "score: 0 idle valve, 1 least possible error; cases: error / least possible error"
+# Of more controllers than `MOST_PICTURED`, the pictures of responses over time show only users'
+# own controllers and `PICTURED`: those of the paper, and the best that know and that are
+# trained.
+MOST_PICTURED = 8
+PICTURED = "nn", "pi", "dahlin", "ppo"
+LONGEST_LABEL = 16  # largest number of characters of a controller's label on the screen
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All results of a comparison that the report shows.
+    """The results of a comparison that the report shows.
 
     Attributes
     ----------
     controllers : mapping
-        Record (`ControllerSpec`) of each controller by name.
+        Record of each controller by name.
+    bounds : sequence of Bound
+        The scenarios in the order of the tables, each with its least possible error.
     results : sequence of Result
         Results of each controller in each scenario, from all tasks that have finished.
-    scales : mapping
-        Least possible errors by the name of the scenario, for all scenarios of the report.
     runs : pandas.DataFrame
-        Table with a row for each run in each scenario, like `comparison.Result.runs`.
+        Table with a row for each run of `results`.
     estimates : pandas.DataFrame
-        Table with a row for each scenario and controller, from `comparison.estimate`.
-    misfits : mapping
-        Sentences that say why a controller does not fit a plant, by the controller's name.
+        Table with a row for each scenario and controller, from `estimates.estimate`.
     scores : mapping
-        Overall score of each controller by name, in the order in which tables list controllers.
+        Overall score of each controller by name, the highest score first.
     """
 
     controllers: Mapping[str, ControllerSpec]
+    bounds: Sequence[Bound]
     results: Sequence[Result]
-    scales: Mapping[str, Scale]
     runs: pd.DataFrame
     estimates: pd.DataFrame
-    misfits: Mapping[str, str]
     scores: Mapping[str, Estimate]
 
-    @property
-    def ranked(self) -> list[str]:
-        """The names of the controllers that fit all plants, the best first."""
-        return [name for name in self.scores if name not in self.misfits]
+    def label(self, agent: str) -> str:
+        """Return the name of a controller in tables."""
+        return self.controllers[agent].label
 
-    @property
-    def pictured(self) -> list[str]:
-        """Names of the controllers whose temperature and flow are drawn, the best first.
-
-        The drawn controllers are the `ranked` controllers, or all controllers if none is
-        ranked. Of more than `MOST_PICTURED` controllers, only controllers whose record has
-        `pictured` true are drawn.
-        """
-        names = self.ranked or list(self.scores)
-        chosen = [name for name in names if self.controllers[name].pictured]
-        if len(names) > MOST_PICTURED and chosen:
-            return chosen
-        return names
+    def travel(self, agent: str) -> str:
+        """Return the mean valve travel of a controller over all scenarios, t/h, as a text."""
+        runs = self.runs[self.runs["agent"] == agent]
+        return f"{runs.groupby('scenario')['total_variation'].mean().mean():,.0f}"
 
 
 def write(
     results: Sequence[Result],
-    scales: Sequence[Scale],
+    bounds: Sequence[Bound],
     controllers: Mapping[str, ControllerSpec],
     folder: Path,
     provenance: Mapping[str, Any],
+    note: str,
     error: CommandError | None,
-) -> None:
-    """Write the CSV files, pictures and report of a comparison, and print the main tables.
+) -> str:
+    """Write the CSV files, pictures and report of a comparison, and return a table for screens.
 
-    A scenario whose least possible errors are not in `scales` is written to the CSV files, but
-    not to the report. `controllers` has the record (`ControllerSpec`) of each controller by
-    name, `provenance` is the provenance of the results, as `provenance_of` returns it, and
-    `error` says which results are missing.
+    A scenario that is not in `bounds` is written to the CSV files, but not to the report.
+    `controllers` has the record of each controller by name, `provenance` is the provenance of
+    the results, as `provenance_of` returns it, `note` is a sentence on controllers that are
+    left out, and `error` says which results are missing.
     """
-    runs = pd.concat([result.runs for result in results], ignore_index=True)
+    tables = [pd.DataFrame(columns) for result in results for columns in result.runs]
+    runs = pd.concat(tables, ignore_index=True)
     write_numbers(folder / "runs.csv", runs)
     write_numbers(folder / "summary.csv", summarise(runs))
     responses = {}
     for name in runs["scenario"].unique():
-        tables = [result.responses for result in results if result.scenario == name]
-        responses[name] = pd.concat(tables)
+        columns = [result.responses for result in results if result.scenario == name]
+        responses[name] = pd.concat(map(pd.DataFrame, columns))
         write_numbers(folder / f"{name}.csv", responses[name])
     # The report has the scenarios with both results and least possible errors.
-    scale_of = {
-        scale.scenario.name: scale for scale in scales if scale.scenario.name in responses
-    }
-    runs = runs[runs["scenario"].isin(list(scale_of))]
+    bounds = [bound for bound in bounds if bound.scenario.name in responses]
+    runs = runs[runs["scenario"].isin([bound.scenario.name for bound in bounds])]
     if runs.empty:
-        return
-    estimates = estimate(runs, scale_of)
+        return note
+    estimates = estimate(runs, bounds, controllers)
     write_numbers(folder / "estimates.csv", estimates.drop(columns="scores"))
-    plants = [scale.scenario.parameters for scale in scale_of.values()]
-    misfits = misfits_of(controllers, plants)
-    comparison = Comparison(
-        controllers=controllers,
-        results=results,
-        scales=scale_of,
-        runs=runs,
-        estimates=estimates,
-        misfits=misfits,
-        scores=ranked(estimates, misfits),
-    )
-    draw(comparison, responses, folder)
-    page = sections(comparison)
-    write_report(folder, "Comparison of controllers", page, provenance, error)
-    show(*page[:2])
-
-
-def draw(comparison: Comparison, responses: Mapping[str, pd.DataFrame], folder: Path) -> None:
-    """Draw PNG files of the scores, and of temperature and flow over time in each scenario.
-
-    `responses` has, by the name of the scenario, a table that joins the tables
-    `Result.responses` of all controllers.
-    """
-    scores = {name: comparison.scores[name] for name in comparison.ranked}
-    if scores:
-        plots.plot_scores(scores, comparison.estimates, folder / "scores.png")
-    errors = comparison.runs.groupby(["scenario", "agent"])["mae"].mean()
-    for name, scale in comparison.scales.items():
-        rows = responses[name]
-        rows = rows[rows["agent"].isin(comparison.pictured)]
+    scores = ranked(estimates)
+    comparison = Comparison(controllers, bounds, results, runs, estimates, scores)
+    plots.plot_scores(scores, estimates, controllers, folder / "scores.png")
+    for scenario, _ in bounds:
+        rows = responses[scenario.name]
+        rows = rows[rows["agent"].isin(pictured(scores))]
         # If the tasks of all pictured controllers have failed, `rows` is empty.
         if not rows.empty:
-            plots.plot_responses(rows, errors[name], scale.scenario, folder / f"{name}.png")
+            errors = runs[runs["scenario"] == scenario.name].groupby("agent")["mae"].mean()
+            path = folder / f"{scenario.name}.png"
+            plots.plot_responses(rows, errors, scenario, controllers, path)
+    page = sections(comparison, note)
+    write_report(folder, "Comparison of controllers", page, provenance, error)
+    return "\n".join(filter(None, [on_screen(comparison), note]))
 
 
-def sections(comparison: Comparison) -> list[Section]:
-    """Return the sections of a comparison's report, without sections whose table is empty."""
-    reference = label(str(comparison.runs["agent"].iloc[0]))
-    scenarios = [scale.scenario for scale in comparison.scales.values()]
-    candidates = [
+def pictured(agents: Iterable[str]) -> list[str]:
+    """Return the names of the controllers whose temperature and flow are drawn."""
+    names = list(agents)
+    chosen = [name for name in names if name in PICTURED or name not in ROSTER]
+    return chosen if len(names) > MOST_PICTURED and chosen else names
+
+
+def sections(comparison: Comparison, note: str) -> list[Section]:
+    """Return the sections of a comparison's report, with `note` in the first section."""
+    scenarios = [scenario for scenario, _ in comparison.bounds]
+    shown = ", ".join(map(comparison.label, pictured(comparison.scores)))
+    about_cases = [CASES_TEXT, f"The pictures show these controllers: {shown}."]
+    if any("Figs" in scenario.title for scenario in scenarios):
+        about_cases.append("Figs are the figures of the paper by Cui and Shin (1992).")
+    return [
         Section(
             "Score: 0 for an idle valve, 1 for the least possible error",
-            [SCORE_TEXT, *notes(comparison)],
+            list(filter(None, [SCORE_TEXT, note])),
             score_table(comparison),
             pictures={"scores.png": "The score of each controller, and its score in each case"},
         ),
@@ -208,24 +164,10 @@ def sections(comparison: Comparison) -> list[Section]:
             [RATIO_TEXT],
             ratio_table(comparison),
         ),
-        Section(
-            f"Difference to the error of the reference: {reference}",
-            [DIFFERENCE_TEXT.format(reference=reference)],
-            difference_table(comparison),
-        ),
-        Section(
-            "Where the error arises on the preset hard",
-            [PARTS_TEXT],
-            parts_table(comparison.runs),
-        ),
-        Section(
-            "What each controller knows and costs",
-            [COSTS_TEXT],
-            costs_table(comparison.results, comparison.controllers, scenarios[0]),
-        ),
+        Section("What each controller knows and costs", [COSTS_TEXT], costs_table(comparison)),
         Section(
             "Cases",
-            notes_on_cases(comparison, scenarios),
+            about_cases,
             cases_table(scenarios),
             pictures={
                 f"{scenario.name}.png": f"Temperature and flow over time: {scenario.title}"
@@ -233,129 +175,69 @@ def sections(comparison: Comparison) -> list[Section]:
             },
         ),
     ]
-    marks = {label(name): f"{label(name)} {MISFIT_MARK}" for name in comparison.misfits}
-    filled = []
-    for section in candidates:
-        table: Any = section.table
-        if table.empty:
-            continue
-        if "controller" in table:
-            table["controller"] = table["controller"].replace(marks)
-        filled.append(section)
-    return filled
-
-
-def notes(comparison: Comparison) -> list[str]:
-    """Return sentences on controllers that are not ranked.
-
-    The notes that users' own controllers have, such as a note on a missing environment, come
-    first.
-    """
-    texts = {
-        str(policy["note"])
-        for result in comparison.results
-        for policy in result.policies
-        if "note" in policy
-    }
-    not_ranked = [
-        f"{MISFIT_MARK} {reason} So its error says little about the controller, which is not "
-        "ranked."
-        for reason in comparison.misfits.values()
-    ]
-    return [*sorted(texts), *not_ranked]
-
-
-def notes_on_cases(comparison: Comparison, scenarios: Sequence[Scenario]) -> list[str]:
-    """Return paragraphs that explain the table of cases, and name the pictured controllers."""
-    texts = [CASES_TEXT]
-    if any("Figs" in scenario.title for scenario in scenarios):
-        texts.append("Figs are the figures of the paper by Cui and Shin (1992).")
-    if len(comparison.pictured) < len(comparison.controllers):
-        names = ", ".join(label(name) for name in comparison.pictured)
-        texts.append(f"The pictures show these controllers: {names}.")
-    return texts
 
 
 def score_table(comparison: Comparison) -> pd.DataFrame:
-    """Return a table of texts with the scores and the mean valve travel of each controller.
-
-    The rows have the order of `Comparison.scores`. A controller that does not fit the plants
-    has the text "not ranked" in place of an overall score.
-    """
-    estimates = comparison.estimates
-    agents = list(comparison.scores)
-    cells = estimates["scores"].map(lambda scores: as_text(scores.mean(), ".2f"))
-    table = table_by_agent(estimates, cells, agents)
-    travels = comparison.runs.groupby(["agent", "scenario"])["total_variation"].mean()
-    overall = []
-    for agent, score in comparison.scores.items():
-        overall.append("not ranked" if agent in comparison.misfits else f"{score:.3f}")
-    table.insert(1, "score", overall)
-    table.insert(2, "travel (t/h)", [f"{travels[agent].mean():,.0f}" for agent in agents])
+    """Return a table of texts with the scores and the mean valve travel of each controller."""
+    means = comparison.estimates["scores"].map(lambda scores: as_text(scores.mean(), ".2f"))
+    table = table_by_agent(comparison, means)
+    scores = [f"{score:.3f}" for score in comparison.scores.values()]
+    table.insert(1, "score", scores)
+    table.insert(2, "travel (t/h)", [comparison.travel(agent) for agent in comparison.scores])
     return table
 
 
 def ratio_table(comparison: Comparison) -> pd.DataFrame:
     """Return a table of texts with least possible errors and error ratios in each scenario.
 
-    The first two rows have the least possible errors without and with knowledge of future set
-    points, degC. Each further row has the error ratios of one controller. The mark * follows a
-    least possible error of the kind "reference", which is the error for set-point changes that
-    come as a surprise: controllers that have learnt the times of the changes can have a smaller
-    error.
+    The first row has the least possible errors, degC, and each further row has the error ratios
+    of one controller. The mark * follows a least possible error of the kind "reference", which
+    is the error for set-point changes that come as a surprise: controllers that have learnt the
+    times of the changes can have a smaller error.
     """
-    bounds = pd.DataFrame({"controller": ["least possible (°C)", "with foresight (°C)"]})
-    for name, scale in comparison.scales.items():
-        mark = "*" if scale.least.kind == "reference" else ""
-        bounds[name] = [f"{scale.least.value:.3f}{mark}", f"{scale.preview:.3f}"]
-    estimates = comparison.estimates
-    cells = estimates["ratio"].map("{:.2f}".format)
-    ratios = table_by_agent(estimates, cells, list(comparison.scores))
-    return pd.concat([bounds, ratios], ignore_index=True)
+    first_row = pd.DataFrame({"controller": ["least possible (°C)"]})
+    for scenario, least in comparison.bounds:
+        mark = "*" if least.kind == "reference" else ""
+        first_row[scenario.name] = [f"{least.value:.3f}{mark}"]
+    ratios = table_by_agent(comparison, comparison.estimates["ratio"].map("{:.2f}".format))
+    return pd.concat([first_row, ratios], ignore_index=True)
 
 
-def difference_table(comparison: Comparison) -> pd.DataFrame:
-    """Return a table of texts that compares each controller with the reference controller.
-
-    The reference controller is that of the first row of `comparison.runs`. A cell has the mean
-    of a controller's error minus the error of the reference controller, degC, and the share of
-    the runs in which the controller has the smaller error. If a comparison has only one
-    controller, the table is empty.
-    """
-    if "difference" not in comparison.estimates:
-        return pd.DataFrame()
-    compared = comparison.estimates.dropna(subset=["difference"])
-    differences = compared["difference"].map("{:+.3f}".format)
-    shares = compared["improvement"].map(lambda share: f"{100 * share.value:.0f} %")
-    return table_by_agent(
-        compared, differences + "; " + shares, list(compared["agent"].unique())
-    )
-
-
-def table_by_agent(rows: pd.DataFrame, cells: Any, agents: Sequence[str]) -> pd.DataFrame:
+def table_by_agent(comparison: Comparison, cells: Any) -> pd.DataFrame:
     """Return a table of texts, with a row for each controller and a column for each scenario.
 
-    `rows` has the columns `scenario` and `agent` (the controller), and `cells` has a text for
-    each row of `rows`. The rows of the returned table have the order of `agents`.
+    `cells` has a text for each row of `comparison.estimates`. The controller with the highest
+    score comes first.
     """
-    table = rows.assign(cell=cells).pivot(index="agent", columns="scenario", values="cell")
-    table = table.loc[list(agents), rows["scenario"].unique()].fillna("").rename(index=label)
+    rows = comparison.estimates.assign(cell=cells)
+    table = rows.pivot(index="agent", columns="scenario", values="cell")
+    table = table.loc[list(comparison.scores), rows["scenario"].unique()].fillna("")
+    table = table.rename(index=comparison.label)
     return table.rename_axis(index="controller", columns=None).reset_index()
 
 
-def parts_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of texts that splits the mean error on the preset `hard` into parts, degC.
+def costs_table(comparison: Comparison) -> pd.DataFrame:
+    """Return a table of texts on each controller's prior knowledge, robustness and costs."""
+    rows = []
+    for name in comparison.scores:
+        controller = comparison.controllers[name]
+        results = [result for result in comparison.results if result.agent == name]
+        row = {
+            "controller": controller.label,
+            "prior knowledge": controller.knows,
+            "Ms": sensitivity_text(results[0].sensitivity),
+            "searched or trained": controller.searched,
+            "processor time (s)": f"{sum(result.seconds for result in results):.1f}",
+        }
+        rows.append(row)
+    return pd.DataFrame(rows)
 
-    The table has a column for each of `PARTS_OF_ERROR`, and a row for each controller, the
-    smallest mean error first.
-    """
-    means = runs[runs["scenario"] == "hard"].groupby("agent")[list(PARTS_OF_ERROR)].mean()
-    texts = means.sort_values("mae").map("{:.3f}".format)
-    return (
-        texts.rename(index=label, columns=PARTS_OF_ERROR)
-        .rename_axis("controller")
-        .reset_index()
-    )
+
+def sensitivity_text(sensitivity: float | None) -> str:
+    """Return the maximum sensitivity Ms of a loop as a text, "" if there is none."""
+    if sensitivity is None:
+        return ""
+    return f"{sensitivity:.2f}" if math.isfinite(sensitivity) else "unstable"
 
 
 def cases_table(scenarios: Sequence[Scenario]) -> pd.DataFrame:
@@ -373,47 +255,30 @@ def cases_table(scenarios: Sequence[Scenario]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def costs_table(
-    results: Sequence[Result], controllers: Mapping[str, ControllerSpec], scenario: Scenario
-) -> pd.DataFrame:
-    """Return a table of texts on each controller's prior knowledge, robustness and costs.
+def on_screen(comparison: Comparison) -> str:
+    """Return the table of scores, error ratios and valve travel for a terminal of 80 columns.
 
-    The robustness of linear controllers is computed with the nominal plant of `scenario`.
-    `controllers` has the record of each controller by name.
+    A heading of two words or more, such as "square zone 7", has its first word in the line
+    above.
     """
-    rows = []
-    for name, controller in controllers.items():
-        own_results = [result for result in results if result.agent == name]
-        # The record of a user's own controller has no texts for the table. The provenance of
-        # the controller may have such texts.
-        policies = [policy for result in own_results for policy in result.policies]
-        provenance = policies[0] if policies else {}
-        sensitivity, delays = robustness_texts(controller, scenario)
-        row = {
-            "controller": label(name),
-            "prior knowledge": controller.knows or provenance.get("knows", ""),
-            "Ms": sensitivity,
-            "stable with delays of (samples)": delays,
-            "searched or trained": controller.searched or provenance.get("searched", ""),
-            "processor time (s)": f"{sum(result.seconds for result in own_results):.1f}",
-        }
-        rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def robustness_texts(controller: ControllerSpec, scenario: Scenario) -> tuple[str, str]:
-    """Return two texts on the robustness of the loop of a controller with a plant.
-
-    The first text is Ms, the maximum sensitivity of the loop with the nominal plant of the
-    scenario, and the second text is the range of the delays, in samples, with which the loop is
-    stable. If the loop is unstable, the texts are "unstable" and "none". If the controller is
-    not linear, both texts are empty.
-    """
-    if not controller.linear:
-        return "", ""
-    loop = controller.loop(scenario.arguments)
-    delays = loop.stable_delays()
-    if delays is None:
-        return "unstable", "none"
-    shortest, longest = delays
-    return f"{loop.sensitivity():.2f}", f"{shortest} to {longest}"
+    headings = [case.heading or case.name for case, _ in comparison.bounds]
+    upper = []
+    lower = []
+    for heading in ("controller", "score", *headings, "travel (t/h)"):
+        first, _, others = heading.partition(" ")
+        upper.append(first if others else "")
+        lower.append(others or first)
+    rows = [upper, lower]
+    ratios = comparison.estimates.set_index(["agent", "scenario"])["ratio"]
+    for agent, score in comparison.scores.items():
+        row = [comparison.label(agent)[:LONGEST_LABEL], f"{score.value:.3f}"]
+        for scenario, _ in comparison.bounds:
+            ratio = ratios.get((agent, scenario.name))
+            row.append("" if ratio is None else f"{ratio.value:.2f}")
+        rows.append([*row, comparison.travel(agent)])
+    first_width, *widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for label, *cells in rows:
+        aligned = [cell.rjust(width) for cell, width in zip(cells, widths, strict=True)]
+        lines.append(" ".join([label.ljust(first_width), *aligned]))
+    return "\n".join([*lines, SCREEN_TEXT])

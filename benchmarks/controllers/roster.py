@@ -1,14 +1,13 @@
-"""List the controllers that the commands can run, as records of the class `ControllerSpec`.
+"""List the controllers that the commands can run, each with the function that makes it.
 
-The command `compare` can run each controller of the roster. The command `tune` can search the
-gains of each controller whose record has `spans`. The option `--agent NAME=MODULE:FACTORY` of
-`compare` makes a record for a user's own controller.
+The function of a controller takes a `KnownPlant` and shows what the controller knows: the
+controller knows what its function takes from the plant. The command `compare` can run each
+controller of `ROSTER`. The command `tune` can search the gains of each controller whose record
+has `spans`.
 """
 
-import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from agents import (
@@ -19,183 +18,330 @@ from agents import (
     SelfTuningController,
     SmithPredictor,
 )
+from agents.controller import PAPER_WINDOWS
 from agents.networks import PRETRAINED
 from agents.pi import SEARCHED_GAINS
-from benchmarks.controllers import plant_scale
+from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.controllers.spec import (
-    BANK,
-    DATA_SHEET,
-    DIRECTION,
-    EVERYTHING,
-    LIMITS,
-    ROBUSTNESS,
-    STEP_TEST,
-    ControllerSpec,
-)
-from benchmarks.loop.rollout import Agent, IdleValve
-from mptc_gym import PRESETS, Parameters
+from benchmarks.controllers.spans import Spans, dahlin_spans, nn_spans, pi_spans
+from benchmarks.lib.seeds import SEEDS
+from benchmarks.loop.rollout import Agent, IdleValve, Trajectory, make_plants, rollout
+from mptc_gym import Parameters
 
-# Default ratio of the closed-loop time constant of Dahlin's controller to the plant's time
-# constant. The small ratio makes the control loop fast; the filter time constant makes the
-# control loop robust.
+# Ratio of the closed-loop time constant of Dahlin's controller to the plant's time constant.
+# The small ratio makes the control loop fast; the filter time constant makes the control loop
+# robust.
 LAMBDA = 0.1
-# The colours and markers that a user's own controllers get in turn.
-OWN_LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d")
+LEARNING = 1200  # samples of the square wave in which a controller learns before it is measured
+COMMISSIONING_SEED = SEEDS["preparation"].first  # of the episodes in which a controller learns
 
 
-def self_tuning(*, widest_dead_zone: float, **prior_knowledge: Any) -> Agent:
-    """Return a self-tuning controller that assumes the largest dead zone of the plant.
+@dataclass(frozen=True, kw_only=True)
+class ControllerSpec:
+    """The record of a controller: everything that commands need to run and describe it.
 
-    `widest_dead_zone` is the largest half width of the dead zone that the plant can have, t/h,
-    and `prior_knowledge` are all further arguments of `SelfTuningController`.
+    Attributes
+    ----------
+    name : str
+        Name of the controller in command-line options and files.
+    label : str
+        Name of the controller in tables and pictures.
+    look : tuple of str
+        Colour and marker of the controller in Matplotlib pictures.
+    make : callable
+        Function `make(plant, runs, seed)` that returns a controller for a batch of `runs` runs,
+        or the controller and a dict of the arguments of its environment, such as
+        `{"action_window": 20}`. `plant` is a `KnownPlant`, and the controller draws random
+        numbers for run i with the seed `seed + i`.
+    knows : str
+        Text for tables that describes the prior knowledge of the controller.
+    searched : str
+        Text for tables that says what was searched or trained before a comparison, and in how
+        many trials and samples.
+    arguments : mapping
+        Further arguments of `make` by name: gains, or a training.
+    trainings : sequence of str
+        Files of trained networks in `agents/pretrained`, or a user's files or factories. A
+        member of the controller is the controller with one of the trainings, which `make` gets
+        as its argument `training`. Commands run all members.
+    direction : int, optional
+        Sign of the gain of the plants that the controller was made for; None if the controller
+        fits plants of both signs.
+    random : bool
+        Whether the controller draws random numbers, such as initial weights.
+    learns : bool
+        Whether the controller goes on learning from one run to the next.
+    spans : callable, optional
+        Function that takes a `KnownPlant`, and returns the interval in which a search looks for
+        each gain.
+    compared : bool
+        Whether the command `compare` runs the controller by default.
     """
-    return SelfTuningController(dead_zone=widest_dead_zone, **prior_knowledge)
+
+    name: str
+    label: str
+    look: tuple[str, str]
+    make: Callable[..., Any]
+    knows: str = ""
+    searched: str = ""
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    trainings: Sequence[str] = ()
+    direction: int | None = None
+    random: bool = False
+    learns: bool = False
+    spans: Callable[[KnownPlant], Spans] | None = None
+    compared: bool = True
+
+    def members(self) -> "list[ControllerSpec]":
+        """Return a record for each training, or `[self]` without trainings."""
+        members = [
+            replace(self, arguments={"training": training}, trainings=())
+            for training in self.trainings
+        ]
+        return members or [self]
+
+    def start(
+        self, plant: Mapping[str, Any], runs: int, seed: int
+    ) -> tuple[Agent, dict[str, Any]]:
+        """Return a new controller for a batch, and the arguments of its environment.
+
+        `plant` are arguments of the environment. The returned arguments define the plant and
+        the controller's observation.
+        """
+        arguments = {**plant, **PAPER_WINDOWS}
+        agent = self.make(KnownPlant(Parameters(**arguments)), runs, seed, **self.arguments)
+        if isinstance(agent, tuple):
+            agent, interface = agent
+            arguments |= interface
+        return agent, arguments
+
+    def run(self, plant: Mapping[str, Any], samples: int, runs: int, seed: int) -> Trajectory:
+        """Run a new controller on a batch of plants, and return the signals of the runs.
+
+        Parameters
+        ----------
+        plant
+            Arguments of the environment.
+        samples
+            Length of a run, in samples.
+        runs
+            Number of runs in the batch.
+        seed
+            Seed of the first run. The environment draws the noise and all other random numbers
+            of run i with the seed `seed + i`.
+        """
+        agent, arguments = self.start(plant, runs, seed)
+        return rollout(make_plants(runs, samples, **arguments), agent, samples, seed)
+
+    def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
+        """Return a controller for `runs` runs, trained on `plant` if the controller learns.
+
+        A controller that learns is first run on `plant` for `LEARNING` samples of the square
+        wave.
+        """
+        agent, arguments = self.start(plant, runs, seed)
+        if self.learns:
+            plants = make_plants(runs, LEARNING, **{**arguments, "setpoint": "square"})
+            rollout(plants, agent, LEARNING, COMMISSIONING_SEED)
+        return agent
 
 
-def dahlin(*, time_constant: float, **arguments: Any) -> Agent:
-    """Return Dahlin's controller for a plant.
+def idle(plant: KnownPlant, runs: int, seed: int) -> Agent:
+    """Return a controller that keeps the flow at 0 t/h."""
+    return IdleValve(**plant.limits)
 
-    `time_constant` is the time constant of the plant, s, and `arguments` are all further
-    arguments of `DahlinController`. The default of `closed_loop_time_constant` is `LAMBDA`
-    times the plant's time constant.
+
+def nn(plant: KnownPlant, runs: int, seed: int, **gains: float) -> Agent:
+    """Return the paper's network, which knows the sign of the gain and learns the rest."""
+    arguments: dict[str, Any] = {**plant.limits, **gains}
+    return DirectNNController(direction=plant.direction, num_envs=runs, seed=seed, **arguments)
+
+
+def pi(plant: KnownPlant, runs: int, seed: int, **gains: float) -> Agent:
+    """Return a PI controller with fixed gains, by default those of the paper."""
+    arguments: dict[str, Any] = {**plant.limits, **gains}
+    return PIController(**arguments)
+
+
+def pi_simc(plant: KnownPlant, runs: int, seed: int) -> Agent:
+    """Return a PI controller that the rule SIMC tunes to a step test."""
+
+    def simc(time_constant: float) -> PIController:
+        return PIController.simc(
+            closed_loop_time_constant=time_constant, **plant.step_test, **plant.limits
+        )
+
+    return plant.robust(simc)
+
+
+def smith(plant: KnownPlant, runs: int, seed: int) -> Agent:
+    """Return a Smith predictor that knows a step test, the dead zone and the limits."""
+
+    def predictor(time_constant: float) -> SmithPredictor:
+        return SmithPredictor(
+            closed_loop_time_constant=time_constant,
+            dead_zone=plant.dead_zone,
+            **plant.step_test,
+            **plant.limits,
+        )
+
+    return plant.robust(predictor)
+
+
+def dahlin(
+    plant: KnownPlant,
+    runs: int,
+    seed: int,
+    closed_loop_time_constant: float | None = None,
+    filter_time_constant: float | None = None,
+) -> Agent:
+    """Return Dahlin's controller, which knows a step test, the dead zone and the limits.
+
+    `closed_loop_time_constant`, s, is by default `LAMBDA` times the time constant of the plant,
+    and `filter_time_constant`, s, is by default chosen for robustness.
     """
-    arguments.setdefault("closed_loop_time_constant", LAMBDA * time_constant)
-    return DahlinController(time_constant=time_constant, **arguments)
+    if closed_loop_time_constant is None:
+        closed_loop_time_constant = LAMBDA * plant.step_test["time_constant"]
+
+    def controller(filter_time_constant: float) -> DahlinController:
+        return DahlinController(
+            closed_loop_time_constant=closed_loop_time_constant,
+            filter_time_constant=filter_time_constant,
+            dead_zone=plant.dead_zone,
+            **plant.step_test,
+            **plant.limits,
+        )
+
+    if filter_time_constant is None:
+        return plant.robust(controller)
+    return controller(filter_time_constant)
 
 
-def with_policy(parameters: Parameters, network: PolicyNetwork, **limits: Any) -> Agent:
-    """Return a trained policy, adapted to the actuator of a plant.
+def self_tuning(plant: KnownPlant, runs: int, seed: int) -> Agent:
+    """Return a self-tuning controller, which selects the best of a bank of plant models.
 
-    `limits` has the flow limits `u_min` and `u_max` of the returned policy, t/h. If the policy
-    was trained to compensate for a dead zone, the returned policy compensates for the dead zone
-    in `parameters` instead, unless the dead zone in `parameters` is a range.
+    The controller knows a step test, the limits, the largest dead zone, and the ranges of the
+    delay and of the set points.
     """
+    return SelfTuningController(
+        dead_zone=plant.widest_dead_zone,
+        delay_range=plant.delay_range,
+        setpoint_holds=plant.setpoint_holds,
+        setpoint_amplitude=plant.parameters.setpoint_amplitude,
+        **plant.step_test,
+        **plant.limits,
+    )
+
+
+def mpc(plant: KnownPlant, runs: int, seed: int) -> Agent:
+    """Return model predictive control, which knows everything except the future."""
+    return PredictiveController(plant.parameters, runs, seed)
+
+
+def ppo(plant: KnownPlant, runs: int, seed: int, training: str) -> tuple[Agent, Any]:
+    """Return a policy that was trained by PPO, and the observation that it needs.
+
+    `training` is the file of the network. A policy that was trained to compensate for a dead
+    zone compensates for the dead zone of `plant` instead, unless that is a range.
+    """
+    network = PolicyNetwork.load(PRETRAINED / training, **plant.limits)
     increments = network.increments
-    dead_zone = parameters.dead_zone
-    if increments and increments.dead_zone and not isinstance(dead_zone, Sequence):
-        increments = replace(increments, dead_zone=dead_zone)
-    return replace(network, increments=increments, **limits)
+    if increments and increments.dead_zone and "dead_zone" not in plant.parameters.ranges:
+        network = replace(network, increments=replace(increments, dead_zone=plant.dead_zone))
+    return network, network.observation
 
 
-def trained(files: str) -> Mapping[str, PolicyNetwork]:
-    """Return trained policies, by the name of the policy's file.
-
-    The files lie in the folder `agents/pretrained`, and have names that match the pattern
-    `files`, such as "ppo-*.npz".
-    """
-    return {file.name: PolicyNetwork.load(file) for file in PRETRAINED.glob(files)}
+def _trained(pattern: str) -> list[str]:
+    """Return the names of the project's network files that match `pattern`."""
+    return sorted(file.name for file in PRETRAINED.glob(pattern))
 
 
 # Texts for reports: what a controller knows, and how the controller was searched or trained. In
 # reports, 1 M samples are a million samples.
 _KNOWS_STEP_TEST = "gain, time constant, delay"
 _KNOWS_DATA_SHEET = f"{_KNOWS_STEP_TEST}, dead zone, limits"
-_KNOWS_SIGN = "sign of the gain; settings searched on the paper's plant"
-_NN_SEARCH = (
-    "25 weights in the run itself; 6 settings by the search of version 0.1; the present search "
-    "takes 800 trials: 566 M samples, 6 min"
-)
-_KNOWS_HOLDS = "hold times of random set points"
 _TUNING_RULE = f"one time constant, by a tuning rule and an Ms of {ROBUSTNESS:g}; one step test"
 _SPECS = (
     ControllerSpec(
         name="idle",
         label="idle valve",
         look=("#8C8C8C", "x"),
-        build=IdleValve,
+        make=idle,
         knows="nothing",
         searched="nothing",
-        observation={},
         compared=False,
     ),
     ControllerSpec(
         name="nn",
         label="NN (1992)",
         look=("#D55E00", "o"),
-        build=DirectNNController,
-        prior_knowledge=DIRECTION,
-        knows=_KNOWS_SIGN,
-        searched=_NN_SEARCH,
-        assumes=("scale",),
+        make=nn,
+        knows="sign of the gain; settings searched on the paper's plant",
+        searched="25 weights in the run itself; 6 settings by the search of version 0.1; the "
+        "present search takes 800 trials: 566 M samples, 6 min",
         random=True,
         learns=True,
-        spans=plant_scale.nn_spans,
-        pictured=True,
+        spans=nn_spans,
     ),
     ControllerSpec(
         name="pi",
         label="PI (1992)",
         look=("#CC79A7", "s"),
-        build=PIController,
+        make=pi,
         knows="gains of the paper, for its plant",
         searched="2 gains; the paper does not say how they were found",
-        linear=True,
-        assumes=("direction", "scale"),
-        spans=plant_scale.pi_spans,
-        pictured=True,
+        direction=-1,
+        spans=pi_spans,
     ),
     ControllerSpec(
         name="pi-simc",
         label="PI (SIMC)",
         look=("#9B2F8C", "h"),
-        build=PIController.simc,
-        prior_knowledge=STEP_TEST,
+        make=pi_simc,
         knows=_KNOWS_STEP_TEST,
         searched=_TUNING_RULE,
-        tuned_by="closed_loop_time_constant",
-        linear=True,
     ),
     ControllerSpec(
         name="pi-searched",
         label="PI (searched)",
         look=("#5A1220", "p"),
-        build=partial(PIController, kp=SEARCHED_GAINS["kp"], ki=SEARCHED_GAINS["ki"]),
+        make=pi,
+        arguments=SEARCHED_GAINS,
         knows="gains searched on the paper's plant",
         searched="2 gains by an earlier version of the search; the present search takes 800 "
         "trials: 566 M samples, 3 min",
-        linear=True,
-        assumes=("direction", "scale"),
+        direction=-1,
     ),
     ControllerSpec(
         name="smith",
         label="Smith",
         look=("#56B4E9", "^"),
-        build=SmithPredictor,
-        prior_knowledge=DATA_SHEET,
+        make=smith,
         knows=_KNOWS_DATA_SHEET,
         searched=_TUNING_RULE,
-        tuned_by="closed_loop_time_constant",
-        linear=True,
     ),
     ControllerSpec(
         name="dahlin",
         label="Dahlin",
         look=("#003F7D", "<"),
-        build=dahlin,
-        prior_knowledge=DATA_SHEET,
+        make=dahlin,
         knows=_KNOWS_DATA_SHEET,
         searched=f"{_TUNING_RULE}; closed-loop time constant by hand: a tenth of the plant's",
-        tuned_by="filter_time_constant",
-        linear=True,
-        spans=plant_scale.dahlin_spans,
-        pictured=True,
+        spans=dahlin_spans,
     ),
     ControllerSpec(
         name="self-tuning",
         label="self-tuning",
         look=("#5FCF9F", "v"),
-        build=self_tuning,
-        prior_knowledge=BANK,
-        knows=f"{_KNOWS_DATA_SHEET}; delay range; {_KNOWS_HOLDS}",
+        make=self_tuning,
+        knows=f"{_KNOWS_DATA_SHEET}; delay range; hold times of random set points",
         searched="about 70 settings by hand; one step test",
     ),
     ControllerSpec(
         name="mpc",
         label="MPC",
         look=("#000000", "*"),
-        build=PredictiveController,
-        prior_knowledge=EVERYTHING,
+        make=mpc,
         knows="everything except the future",
         searched="nothing",
     ),
@@ -203,50 +349,25 @@ _SPECS = (
         name="ppo",
         label="PPO",
         look=("#E69F00", "D"),
-        build=with_policy,
-        prior_knowledge=("parameters", *LIMITS),
+        make=ppo,
+        trainings=_trained("ppo-[0-9]*.npz"),
         knows="dead zone; trained on a simulator of the paper's plant",
         searched="388 weights on the paper's plant: 5 M samples a policy; settings by 79 "
         "trials: 121 M samples, 30 min",
-        assumes=("direction", "scale"),
-        networks=partial(trained, "ppo-[0-9]*.npz"),
-        pictured=True,
+        direction=-1,
     ),
     ControllerSpec(
         name="ppo-hard",
         label="PPO (hard)",
         look=("#8F6200", "D"),
-        build=with_policy,
-        prior_knowledge=("parameters", *LIMITS),
+        make=ppo,
+        trainings=_trained("ppo-hard-*.npz"),
         knows="limits; trained on a simulator of the plants of the preset hard",
         searched="12,608 weights on plants that vary: 4 M samples a policy; settings by 43 "
         "trials: 36 M samples, 12 min",
-        assumes=("direction", "scale"),
-        made_for=PRESETS["hard"],
-        networks=partial(trained, "ppo-hard-*.npz"),
+        direction=-1,
     ),
 )
 
 ROSTER = {spec.name: spec for spec in _SPECS}
 """All controllers by name."""
-
-
-def label(agent: str) -> str:
-    """Return the name of a controller in tables and pictures, such as "MPC" for "mpc".
-
-    `agent` is the controller's name in options. In tables and pictures, a user's own controller
-    has the same name as in options.
-    """
-    return ROSTER[agent].label if agent in ROSTER else agent
-
-
-def looks(agents: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return the colour and the marker, for matplotlib, of each controller by its name.
-
-    Users' own controllers, which are not in `ROSTER`, get the colours and markers of
-    `OWN_LOOKS` in alphabetical order of the names, so that the order of `agents` does not
-    matter.
-    """
-    own_names = sorted(agent for agent in agents if agent not in ROSTER)
-    own_looks = dict(zip(own_names, itertools.cycle(OWN_LOOKS), strict=False))
-    return {agent: own_looks.get(agent) or ROSTER[agent].look for agent in agents}

@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.polynomial.polynomial import polyadd, polyval
@@ -299,6 +299,7 @@ def _time_of(level: float, response: Array) -> float:
     return float(k - 1 + share)
 
 
+@runtime_checkable
 class LinearController(Protocol):
     """The interface of a controller with a linear transfer function."""
 

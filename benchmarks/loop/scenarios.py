@@ -32,12 +32,15 @@ class Scenario:
     arguments : dict
         Arguments of the environment that differ from the defaults, for the plant and the set
         point.
+    heading : str
+        Short name of the case in tables on the screen; "" for `name`.
     """
 
     name: str
     title: str
     samples: int
     arguments: Arguments
+    heading: str = ""
 
     @property
     def parameters(self) -> Parameters:
@@ -69,30 +72,35 @@ SCENARIOS = {
         "square wave, dead zone 7 t/h, no noise (Figs 6 and 7)",
         1200,
         PRESETS["dead-zone-7"],
+        "square zone 7",
     ),
     "square-noise": Scenario(
         "square-noise",
         "square wave, dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)",
         1200,
         PRESETS["noisy"],
+        "square noise",
     ),
     "constant": Scenario(
         "constant",
         "constant set point, dead zone 5 t/h, no noise (Figs 5 and 10)",
         600,
         {**PRESETS["paper"], **_CONSTANT},
+        "const",
     ),
     "constant-dead-zone-7": Scenario(
         "constant-dead-zone-7",
         "constant set point, dead zone 7 t/h, no noise (Figs 6 and 7)",
         600,
         {**PRESETS["dead-zone-7"], **_CONSTANT},
+        "const zone 7",
     ),
     "constant-noise": Scenario(
         "constant-noise",
         "constant set point, dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)",
         600,
         {**PRESETS["noisy"], **_CONSTANT},
+        "const noise",
     ),
     # Rejecting load steps is the usual work of a boiler's controller. At a set point of 5 degC,
     # the flow that the controller needs stays outside the dead zone.
@@ -104,8 +112,9 @@ SCENARIOS = {
     ),
 }
 """The cases of the paper, and a case with steps of the load, by name."""
+_HEADINGS = {"dead-zone-7": "dead zone 7", "disturbed": "disturb.", "randomised": "random."}
 PRESET_SCENARIOS = {
-    name: Scenario(name, f"preset {name}", 1200, dict(arguments))
+    name: Scenario(name, f"preset {name}", 1200, dict(arguments), _HEADINGS.get(name, ""))
     for name, arguments in PRESETS.items()
 }
 

@@ -20,8 +20,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
 from agents import Increments, PolicyNetwork
-from benchmarks.controllers.plant_scale import scale_of
-from benchmarks.controllers.spec import LIMITS, knowledge
+from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
 from benchmarks.lib.outputs import versions
 from benchmarks.lib.seeds import SEEDS
@@ -146,8 +145,8 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
     }
     noisy = dict(training)
     if parameters.range_of("noise_variance")[1] == 0.0:
-        scale, paper_scale = scale_of(parameters), scale_of(paper)
-        ratio = scale.temperature_range / paper_scale.temperature_range
+        paper_range = KnownPlant(paper).temperature_range
+        ratio = KnownPlant(parameters).temperature_range / paper_range
         noisy["noise_variance"] = _NOISE * ratio**2
     # A period of 500 samples for the paper's 600, and always an even number of samples.
     half_period = max(1, round(parameters.setpoint_period * 500 / 1200))
@@ -188,8 +187,7 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
     seconds = time.process_time() - began
     policy = export(model, recipe)
     if plant is not None:
-        parameters = Parameters(**plant)
-        policy = replace(policy, **knowledge(LIMITS, parameters, 1, seed))
+        policy = replace(policy, **KnownPlant(Parameters(**plant)).limits)
     validation = {}  # mean errors, degC
     for name, case in recipe.cases.items():
         result = evaluate(policy, seed=VALIDATION_SEED, **recipe.windows, **case)

@@ -1,0 +1,142 @@
+"""Estimate errors, error ratios and scores of controllers from their runs."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from benchmarks.compare.runs import Bound
+from benchmarks.controllers.roster import ControllerSpec
+from benchmarks.lib.outputs import write_csv
+from benchmarks.lib.statistics import Estimate, bootstrap, percentiles
+from benchmarks.loop.rollout import is_random
+
+BOOTSTRAP_SEED = 0  # seed of the resampling for confidence intervals, not of an episode
+
+
+def estimate(
+    runs: pd.DataFrame, bounds: Sequence[Bound], controllers: Mapping[str, ControllerSpec]
+) -> pd.DataFrame:
+    """Estimate the mean errors and the scores of controllers, with 95 % confidence intervals.
+
+    Parameters
+    ----------
+    runs : pandas.DataFrame
+        Table with a row for each run, and the columns `scenario`, `agent` (the controller),
+        `policy` (the number of the controller's member), `seed` and `mae` (the mean absolute
+        error of the run, degC). The controller in the first row is the reference controller,
+        with which all other controllers are compared.
+    bounds : sequence of Bound
+        Least possible errors. A scenario that has none is left out of the result.
+    controllers : mapping
+        Record of each controller by name.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Table with a row for each scenario and controller, and these columns in addition to
+        `scenario` and `agent`:
+
+        - `limit`: the least possible error, degC;
+        - `mean`: the mean error over the runs, degC, an `Estimate`. If runs use random numbers
+          and the table has only one run, the ends of the confidence interval are infinite;
+        - `ratio`: the error ratio, which is `mean` divided by `limit`, an `Estimate`;
+        - `scores`: an array with the score of each run, shape (members, runs);
+        - `difference`: the mean over the runs of the controller's error minus the error of the
+          reference controller in the same run (the mean over its members), degC, an `Estimate`;
+        - `improvement`: the share of the runs in which the controller's error is smaller than
+          the error of the reference controller, an `Estimate`. A run in which both controllers
+          have equal errors counts as half a run.
+    """
+    reference = runs["agent"].iloc[0]
+    rows = []
+    for scenario, least in bounds:
+        name = scenario.name
+        errors_of = errors_by_agent(runs[runs["scenario"] == name])
+        is_noisy = is_random(scenario.parameters)
+        for agent, errors in errors_of.items():
+            mean = bootstrap(errors, seed=BOOTSTRAP_SEED)
+            if errors.size == 1 and (controllers[agent].random or is_noisy):
+                mean = replace(mean, low=-math.inf, high=math.inf)
+            row = {
+                "scenario": name,
+                "agent": agent,
+                "limit": least.value,
+                "mean": mean,
+                "ratio": mean.scaled(1 / least.value),
+                "scores": least.score(errors),
+            }
+            if agent != reference and reference in errors_of:
+                reference_errors = errors_of[reference].mean(axis=0)
+                differences = errors - reference_errors
+                is_better = (differences < 0.0) + 0.5 * (differences == 0.0)
+                row["difference"] = bootstrap(differences, seed=BOOTSTRAP_SEED)
+                row["improvement"] = bootstrap(is_better, seed=BOOTSTRAP_SEED)
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
+    """Return the errors of each controller, degC, shape (members, runs), by controller name.
+
+    `runs` is a table with the rows of one scenario.
+    """
+    errors = {}
+    for agent, rows in runs.groupby("agent", sort=False):
+        table = rows.pivot_table(index="policy", columns="seed", values="mae")
+        errors[str(agent)] = table.to_numpy()
+    return errors
+
+
+def ranked(estimates: pd.DataFrame) -> dict[str, Estimate]:
+    """Return the overall score of each controller by name, the highest score first.
+
+    The overall score is the mean score over all scenarios, members and runs, with the 95 %
+    confidence interval of `bootstrap`.
+    """
+    scores = {
+        str(agent): bootstrap(*tables, seed=BOOTSTRAP_SEED)
+        for agent, tables in estimates.groupby("agent", sort=False)["scores"]
+    }
+    return dict(sorted(scores.items(), key=lambda item: -item[1].value))
+
+
+def summarise(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return percentiles over runs of measures such as the mean error and the valve travel.
+
+    The returned table has a row for each scenario, controller and measure, with the columns
+    `scenario`, `agent`, `metric` (the name of the measure), `runs` (the number of runs),
+    `median`, `p10` and `p90`. The argument `runs` is a table with a row for each run.
+    """
+    measures = runs.columns.drop(["scenario", "agent", "policy", "seed"])
+    rows = []
+    for (scenario, agent), group in runs.groupby(["scenario", "agent"], sort=False):
+        for name in measures:
+            row = {"scenario": scenario, "agent": agent, "metric": name, "runs": len(group)}
+            rows.append({**row, **percentiles(group[name].to_numpy())})
+    return pd.DataFrame(rows)
+
+
+def write_numbers(path: Path, table: pd.DataFrame) -> None:
+    """Write a table of numbers, texts and objects of class `Estimate` to the CSV file `path`.
+
+    A column NAME of estimates becomes three columns: NAME has the values, and NAME_low and
+    NAME_high have the ends of the confidence intervals. An infinite end of an interval becomes
+    an empty cell. The infinite settling time of a run that does not settle becomes "not
+    settled".
+    """
+    columns: dict[Any, Any] = {}
+    for name, cells in table.items():
+        if any(isinstance(cell, Estimate) for cell in cells):
+            for field, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
+                # A cell without an estimate is NaN, which does not have the attribute.
+                numbers = pd.Series([getattr(cell, field, math.nan) for cell in cells])
+                columns[f"{name}{suffix}"] = numbers.replace([math.inf, -math.inf], math.nan)
+        else:
+            columns[name] = cells.replace(math.inf, "not settled")
+    write_csv(path, pd.DataFrame(columns))

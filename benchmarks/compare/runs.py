@@ -1,0 +1,158 @@
+"""Run controllers in scenarios, and compute the least possible errors.
+
+A scenario is a plant, a set point and a length of the runs. The error of a run is the mean of
+|e|, the absolute error, over the samples of the run. The functions of this module run in worker
+processes, which need no pandas, as pandas takes long to import.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.bounds.least import LeastPossible, least_possible
+from benchmarks.controllers.roster import ControllerSpec
+from benchmarks.lib.statistics import percentiles
+from benchmarks.loop.linear import LinearController, LinearLoop, nominal
+from benchmarks.loop.rollout import Trajectory, is_random, make_plants, measure, rollout
+from benchmarks.loop.scenarios import Scenario
+from mptc_gym.evaluation import EPISODES
+
+Columns = dict[str, Any]  # the columns of a table by name: arrays, or one value for all rows
+
+
+@dataclass(frozen=True)
+class Result:
+    """The results of one controller in one scenario.
+
+    The members of a controller are its trainings, and each member has its own runs. A
+    controller without trainings has one member.
+
+    Attributes
+    ----------
+    scenario : str
+        Name of the scenario.
+    agent : str
+        Name of the controller in options, such as "mpc".
+    runs : sequence of dict
+        A table for each member with a row for each run, and the columns `scenario`, `agent`,
+        `policy` (the number of the member), `seed`, and the measures that
+        `benchmarks.loop.rollout.measure` returns.
+    responses : dict
+        Table of temperature and flow with a row for each sample, from `responses_over_time`.
+    sensitivity : float, optional
+        Maximum sensitivity Ms of the loop with the nominal plant, infinite for an unstable
+        loop; None if the controller is not linear.
+    seconds : float
+        Processor time of the runs, s.
+    """
+
+    scenario: str
+    agent: str
+    runs: Sequence[Columns]
+    responses: Columns
+    sensitivity: float | None
+    seconds: float
+
+
+def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: int) -> Result:
+    """Run all members of a controller in a scenario, and return the results.
+
+    If neither the scenario nor the controller uses random numbers, each member runs only once,
+    and the results have a copy of this run for each seed.
+
+    `runs` is the number of runs of each member, and run i has the seed `seed + i`.
+    """
+    start = time.process_time()
+    are_equal = not (controller.random or is_random(scenario.parameters))
+    simulated_runs = 1 if are_equal else runs
+    sensitivity = None
+    trajectories = []
+    tables = []
+    for number, member in enumerate(controller.members()):
+        agent, arguments = member.start(scenario.arguments, simulated_runs, seed)
+        plants = make_plants(simulated_runs, scenario.samples, **arguments)
+        trajectory = rollout(plants, agent, scenario.samples, seed)
+        columns: Columns = {
+            "scenario": scenario.name,
+            "agent": controller.name,
+            "policy": number,
+            "seed": range(seed, seed + runs),
+        }
+        for name, values in measure(trajectory, scenario.parameters).items():
+            columns[name] = np.broadcast_to(values, runs)
+        trajectories.append(trajectory)
+        tables.append(columns)
+        if isinstance(agent, LinearController):
+            loop = LinearLoop.of(agent, nominal(scenario.parameters))
+            sensitivity = loop.sensitivity()
+    return Result(
+        scenario=scenario.name,
+        agent=controller.name,
+        runs=tables,
+        responses=responses_over_time(trajectories, scenario, controller.name),
+        sensitivity=sensitivity,
+        seconds=time.process_time() - start,
+    )
+
+
+def responses_over_time(
+    trajectories: Sequence[Trajectory], scenario: Scenario, agent: str
+) -> Columns:
+    """Return a table of a controller's temperature and flow over time, one row for each sample.
+
+    The columns are `agent`, `sample`, `time_s` (s) and `setpoint` (degC); `output_run` (degC)
+    and `applied_run` (t/h), the temperature and the applied flow of the first run; and the
+    percentiles `output_median`, `output_p10`, `output_p90`, `applied_median`, `applied_p10` and
+    `applied_p90` over all runs of all members. If the set points are random, the runs have
+    different set points, and the percentiles are the values of the first run.
+    """
+    setpoint = trajectories[0].setpoint[:, 0]
+    k = np.arange(len(setpoint))
+    interval = scenario.parameters.sampling_interval
+    columns: Columns = {
+        "agent": agent,
+        "sample": k,
+        "time_s": k * interval,
+        "setpoint": setpoint,
+    }
+    for signal in ("output", "applied"):
+        values = np.hstack([getattr(trajectory, signal) for trajectory in trajectories])
+        columns[f"{signal}_run"] = values[:, 0]
+        if scenario.parameters.setpoint == "random":
+            values = values[:, :1]
+        # The method "nearest" returns a percentile that occurred in a run. An interpolated
+        # percentile of the applied flow could lie in the dead zone.
+        for name, percentile in percentiles(values, "nearest").items():
+            columns[f"{signal}_{name}"] = percentile
+    return columns
+
+
+class Bound(NamedTuple):
+    """The least possible error in a scenario."""
+
+    scenario: Scenario
+    least: LeastPossible
+
+
+def least_error(scenario: Scenario, runs: int, seed: int) -> Bound:
+    """Return the least possible error in a scenario, a mean over episodes.
+
+    As least possible errors take long to compute, the mean is over the first `runs` episodes,
+    but at most over `EPISODES` episodes. Episode i has the seed `seed + i`.
+
+    Raises
+    ------
+    ValueError
+        If the error of an idle valve in `scenario` is not above the least possible error.
+    """
+    episodes = min(runs, EPISODES)
+    least = least_possible(
+        samples=scenario.samples, episodes=episodes, seed=seed, **scenario.arguments
+    )
+    # Without scores, a case cannot be reported. So the method is called here, where a
+    # ValueError ends only the task of this case.
+    least.score(0.0)
+    return Bound(scenario, least)
