@@ -26,7 +26,6 @@ from agents import (
 from agents.networks import PRETRAINED
 from benchmarks.loop.rollout import make_plants, rollout
 from mptc_gym import MiddlePointEnv, Parameters
-from mptc_gym.wrappers import IncrementalAction
 from tests.conftest import STEP_TEST, assert_the_seed_is_all_that_differs
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
@@ -389,18 +388,18 @@ class TestPolicyNetwork:
     )
     @example(u_min=-12.0, u_max=6.0, dead_zone=4.0, max_move=0.1, outputs=[0.1, 0.1])
     @example(u_min=-12.0, u_max=3.0, dead_zone=4.0, max_move=1.0, outputs=[0.5, 1.0])
-    def test_increments_are_the_velocity_form_of_the_wrapper(
+    def test_increments_are_the_velocity_form_of_the_environment(
         self, u_min, u_max, dead_zone, max_move, outputs
     ):
         increments = Increments(max_move, dead_zone)
         network = one_weight_policy(1.0, 0.0, increments=increments, u_min=u_min, u_max=u_max)
-        plant = MiddlePointEnv(dead_zone=0.0, u_min=u_min, u_max=u_max)
-        wrapped = IncrementalAction(plant, max_move=max_move, compensate_dead_zone=dead_zone)
-        wrapped.reset(seed=0)
+        form = {"max_move": max_move, "compensated_dead_zone": dead_zone}
+        plant = MiddlePointEnv(dead_zone=0.0, u_min=u_min, u_max=u_max, action="change", **form)
+        plant.reset(seed=0)
         flow, most = 0.0, max_move * (u_max - u_min) / 2.0
         for output in np.float32(outputs):
             network.act([output])
-            command = wrapped.step(output[np.newaxis])[-1]["command"]
+            command = plant.step(output[np.newaxis])[-1]["command"]
             flow = np.clip(flow + most * np.clip(output, -1.0, 1.0), u_min, u_max)
             # If the wanted flow is 0 apart from rounding, its sign is random.
             if abs(flow) > 1e-5:

@@ -17,7 +17,6 @@ from benchmarks.examples import sb3
 from benchmarks.loop.rollout import make_plants, rollout
 from benchmarks.train import __main__ as program
 from benchmarks.train import ppo
-from mptc_gym.wrappers.vector import IncrementalAction
 from tests.conftest import ROOT
 
 RECIPE = replace(
@@ -112,23 +111,22 @@ class TestExport:
         ("recipe", "scale"),  # of the action: with limits that matter
         [(RECIPE, 300.0), (replace(RECIPE, levels=True, hidden=(), dead_zone=0.0), 1.0)],
     )
-    def test_without_torch_it_does_what_it_does_in_its_wrapper(self, recipe, scale):
+    def test_without_torch_it_does_what_it_does_in_its_training(self, recipe, scale):
         model = ppo.begin(recipe, 5)
         with torch.no_grad():
             model.policy.action_net.weight.mul_(scale)
         network = ppo.export(model, recipe)
-        plants = make_plants(3, 80, setpoint=5.0, noise_variance=0.5, **recipe.windows)
-        run = rollout(plants, network, 80, seed=1)
-        wrapped = IncrementalAction(
-            plants, max_move=ppo.MAX_MOVE, compensate_dead_zone=recipe.dead_zone
-        )
-        observations, info = wrapped.reset(seed=1)
+        plant = {"setpoint": 5.0, "noise_variance": 0.5, **recipe.windows}
+        run = rollout(make_plants(3, 80, **plant), network, 80, seed=1)
+        form = {"max_move": ppo.MAX_MOVE, "compensated_dead_zone": recipe.dead_zone}
+        changing = make_plants(3, 80, action="change", **form, **plant)
+        observations, info = changing.reset(seed=1)
         moves = []
         for k in range(80):
             np.testing.assert_allclose(run.output[k], info["output"], atol=1e-3)
             seen = observations @ ppo.features(recipe).T
             moves.append(model.predict(seen, deterministic=True)[0])
-            observations, *_, info = wrapped.step(moves[-1])
+            observations, *_, info = changing.step(moves[-1])
             np.testing.assert_allclose(run.applied[k], info["applied"], atol=1e-3)
         assert np.ptp(run.applied) > 1.0
         assert (np.abs(moves).max() == 1.0) == (scale > 1.0)

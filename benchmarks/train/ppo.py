@@ -27,7 +27,6 @@ from benchmarks.lib.seeds import SEEDS
 from mptc_gym import PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.sb3 import GymnasiumVecEnv
-from mptc_gym.wrappers.vector import IncrementalAction
 
 Array = NDArray[np.float64]
 
@@ -237,14 +236,13 @@ class Plants(GymnasiumVecEnv):
                 "MiddlePoint-v0",
                 plants.number,
                 autoreset_mode="SameStep",
+                action="change",
+                max_move=MAX_MOVE,
+                compensated_dead_zone=recipe.dead_zone,
                 **recipe.windows,
                 **plants.arguments,
             )
-            batches.append(
-                IncrementalAction(
-                    batch, max_move=MAX_MOVE, compensate_dead_zone=recipe.dead_zone
-                )
-            )
+            batches.append(batch)
         super().__init__(*batches, group=GROUP)
         self._features = features(recipe).T.astype(np.float32)
         self.observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
