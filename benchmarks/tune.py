@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
 
 SEED = SEEDS["sampler"].first  # seed of Optuna's sampler in the first trial
 STARTUP = 200  # number of trials with random gains, before Optuna's sampler chooses gains
+RUNS = 100  # number of runs of each case in a trial
 FIRST_RUN = SEEDS["preparation"].first  # seed of the first run of every trial
 SPACING_OF_CASES = 100_000  # difference between the first seeds of two successive cases
 FINALISTS = 10  # number of best trials whose gains are scored again on new runs
@@ -36,27 +36,15 @@ FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first new run
 # Penalty for a run that does not settle, degC: the mean error of an idle valve if the set point
 # is 5 degC.
 PENALTY = 5.0
-LARGEST_ZONE = 0.95  # largest dead zone of a case, as a share of the larger limit of the flow
-# Functions that return the ranges of gains for a search, by the name of the controller.
-SPANS = {name: spec.spans for name, spec in ROSTER.items() if spec.spans}
-# By the name of the controller of a search: the controllers in `ROSTER` with the same structure
-# and other gains, each with the origin of the gains as a text for the report.
-FIXED_GAINS = {
-    "nn": {"nn": "the search of version 0.1"},
-    "pi": {"pi": "the paper", "pi-searched": "the search of version 0.1"},
-    "dahlin": {"dahlin": "a tuning rule"},
-}
+# Controllers of the roster with the structure of the searched controller and other gains.
+PRESENT = {"nn": ["nn"], "pi": ["pi", "pi-searched"], "dahlin": ["dahlin"]}
 NOTE = (
     "For each case, the table gives the median over the runs of the mean absolute error, in "
-    "°C. The column “not converged” gives the share of runs that do not settle at the constant "
+    "°C. The column 'not converged' gives the share of runs that do not settle at the constant "
     f"set point. The objective is the mean of the medians, plus {PENALTY:g} °C times this "
     "share; if a plant has set points other than those of the paper's plant, the penalty is "
-    "scaled with the set points."
-)
-FINALS_NOTE = "The column “in the search” gives the objective of the same gains in the search."
-FIXED_NOTE = (
-    "Other commands, such as benchmarks.compare, run controllers with the gains in the "
-    "following table. The table gives the objective of these gains on the new runs."
+    "scaled with the set points. The column 'in the search' gives the objective of the same "
+    "gains in the search. The last rows are the controllers that other commands run."
 )
 PAPER = Parameters()  # the paper's plant
 PAPER_NOISE = PRESETS["noisy"]["noise_variance"]  # noise variance R of the paper, degC^2
@@ -104,101 +92,84 @@ class Options:
     A search that was stopped goes on, to the same result, if --out names its folder.
     """
 
-    controller: Annotated[str, Parameter(choices=SPANS)] = field(kw_only=False)
+    controller: Annotated[str, Parameter(choices=PRESENT)] = field(kw_only=False)
     """Name of the controller whose gains to search."""
     trials: Count = 800
     """Number of sets of gains to try, with those of a search that goes on."""
-    runs: Count = 100
-    """Number of runs of each case in a trial."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     out: Folder = None
 
 
 def work(options: Options) -> None:
-    """Search for gains, write the results, and print a report."""
+    """Search for gains, write the results, and print the best gains."""
     from benchmarks.lib.report import Section, show, write_report
 
     name = options.controller
     plant = options.plant.arguments()
-    gains = [*spans_of(name, plant)]
+    try:
+        spans = ROSTER[name].spans(KnownPlant(Parameters(**plant)))  # type: ignore[misc]
+    except ValueError as error:
+        raise CommandError(f"--plant: {error}") from error
     provenance = provenance_of(seeds={"sampler": SEED, "runs": FIRST_RUN})
     folder = new_folder(options.out, f"tune-{name}", provenance, goes_on=True)
-    trials = search(name, plant, options.trials, options.runs, folder)
+    trials = search(name, plant, spans, options.trials, folder)
     write_csv(folder / "trials.csv", trials)
-    finalists = finals(name, plant, trials)
-    samples = options.runs * sum(case.samples for case in cases(plant).values())
-    budget = f"{len(trials)} trials: {len(trials) * samples / 1e6:.3g} M samples"
+    finalists = finals(name, plant, list(spans), trials)
+    samples = len(trials) * RUNS * sum(case.samples for case in cases(plant).values())
+    budget = f"{len(trials)} trials: {samples / 1e6:.3g} M samples"
     content = {
         "controller": name,
-        "gains": finalists.loc[0, gains].to_dict(),
+        "gains": finalists.loc[0, list(spans)].to_dict(),
         "plant": plant,
         # A text for the column "prior knowledge" of the reports of `benchmarks.compare`.
         "knows": "gains of a search on this plant",
-        "searched": f"{len(gains)} gains by {budget}",
+        "searched": f"{len(spans)} gains by {budget}",
     }
     write_json(folder / "gains.json", content)
     title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS:,} new runs"
-    best = Section(title, [NOTE, FINALS_NOTE], finalists.map("{:.4g}".format))
-    fixed = Section("Gains before this search", [FIXED_NOTE], fixed_gains(name, plant))
-    write_report(folder, f"Gains: {ROSTER[name].label}", [best, fixed], provenance)
-    show(best, fixed)
-    words = [*options.plant.command_line(), "--agent", f"my-{name}={folder}/gains.json"]
-    print(
-        f"All trials are in {folder}/trials.csv, and the best gains are in {folder}/report.md. "
-        "The following command compares the best gains with other controllers: python -m "
-        f"benchmarks.compare {shlex.join(words)}"
-    )
+    texts = finalists.map(lambda cell: cell if isinstance(cell, str) else f"{cell:.4g}")
+    best = Section(title, [NOTE], texts.replace("nan", ""))
+    write_report(folder, f"Gains: {ROSTER[name].label}", [best], provenance)
+    show(best)
+    run = f"python -m benchmarks.compare --agent my-{name}={folder}/gains.json"
+    print(f"To run the best gains on a plant: {run}")
 
 
-def finals(name: str, plant: Arguments, trials: pd.DataFrame) -> pd.DataFrame:
+def finals(name: str, plant: Arguments, gains: list[str], trials: pd.DataFrame) -> pd.DataFrame:
     """Return a table of the scores of the best `FINALISTS` trials on new runs, best first.
 
     New runs are necessary because the best result of many trials is partly luck. The gains of
     the best trials are rounded to three digits before the new runs. A row has the numbers that
     `score` returns for the new runs, and "in the search", the objective of the gains before
-    rounding in the search, degC. `trials` is the table that `search` returns.
+    rounding in the search, degC. Rows of the controllers in `PRESENT` follow.
+
+    Parameters
+    ----------
+    name
+        Name of the controller.
+    plant
+        Arguments of the environment for the plant.
+    gains
+        Names of the gains.
+    trials
+        The table that `search` returns.
     """
     import pandas as pd
 
     best = trials.nsmallest(FINALISTS, "objective")
-    gains = [*spans_of(name, plant)]
     rounded: Any = best[gains].map(lambda gain: float(f"{gain:.3g}")).to_dict("records")
     rows = [score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, finalist) for finalist in rounded]
     table = pd.DataFrame(rows)
     table["in the search"] = best["objective"].to_numpy()
-    return table.sort_values("objective", ignore_index=True)
-
-
-def fixed_gains(name: str, plant: Arguments) -> pd.DataFrame:
-    """Return a table of the objectives, on new runs, of gains that are older than the search.
-
-    The table has a row for each controller in `FIXED_GAINS[name]`, with the label of the
-    controller, the origin of the gains, the gains, and the objective, degC, all as strings.
-    """
-    import pandas as pd
-
-    rows = []
-    for other, origin_of_gains in FIXED_GAINS[name].items():
-        controller: Any = ROSTER[other].start(plant, 1, 0)[0]
-        gains = {gain: getattr(controller, gain) for gain in spans_of(name, plant)}
-        objective = score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, gains)["objective"]
-        numbers = {**gains, "objective": objective}
-        row = {"controller": ROSTER[other].label, "origin": origin_of_gains}
-        rows.append(row | {key: f"{number:.4g}" for key, number in numbers.items()})
-    return pd.DataFrame(rows)
-
-
-def spans_of(name: str, plant: Arguments) -> Spans:
-    """Return the range in which to search for each gain of a controller, by the gain's name.
-
-    A range is a pair of values with the same sign: the value with the smallest magnitude, and
-    the value with the largest magnitude. A `CommandError` is raised if the plant has no gain or
-    time constant that defines the ranges.
-    """
-    try:
-        return SPANS[name](KnownPlant(Parameters(**plant)))
-    except ValueError as error:
-        raise CommandError(f"--plant: {error}") from error
+    table = table.sort_values("objective")
+    table.insert(0, "gains", "of the search")
+    present = []
+    for other in PRESENT[name]:
+        controller, _ = ROSTER[other].start(plant, 1, 0)
+        values = {gain: getattr(controller, gain) for gain in gains}
+        row = score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, values)
+        present.append({"gains": f"of {ROSTER[other].label}", **row})
+    return pd.concat([table, pd.DataFrame(present)], ignore_index=True)
 
 
 def cases(plant: Arguments) -> dict[str, TuningCase]:
@@ -210,50 +181,43 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     the case "constant", the plant has neither noise nor load, so that every good control loop
     can settle.
     """
-    parameters = Parameters(**plant)
-    amplitude = parameters.setpoint_amplitude / PAPER.setpoint_amplitude
-    duration = parameters.setpoint_period / PAPER.setpoint_period
-    noise = middle(parameters, "noise_variance") / PAPER_NOISE
+    known, paper = KnownPlant(Parameters(**plant)), KnownPlant(PAPER)
+    duration = known.parameters.setpoint_period / PAPER.setpoint_period
+    noise = float(known.model.numbers.noise_variance) / PAPER_NOISE
     if noise == 0.0:  # The noise variance is scaled with the square of temperature changes.
-        paper_range = KnownPlant(PAPER).temperature_range
-        noise = (KnownPlant(parameters).temperature_range / paper_range) ** 2
+        noise = (known.temperature_range / paper.temperature_range) ** 2
+    amplitude = amplitude_of(plant)
     factors = {
         "setpoint": amplitude,
         "setpoint_amplitude": amplitude,
         "setpoint_period": duration,
-        "dead_zone": middle(parameters, "dead_zone") / middle(PAPER, "dead_zone"),
+        "dead_zone": known.dead_zone / paper.dead_zone,
         "noise_variance": noise,
     }
-    lowest_u_max = parameters.range_of("u_max")[0]
-    highest_u_min = parameters.range_of("u_min")[1]
-    widest_zone = LARGEST_ZONE * max(abs(highest_u_min), abs(lowest_u_max))
     scaled_cases: dict[str, TuningCase] = {}
     for name, case in CASES.items():
         scaled = {key: factors[key] * value for key, value in case.arguments.items()}
         if "setpoint_period" in scaled:  # The period must be an even number of samples.
             scaled["setpoint_period"] = max(2, 2 * round(scaled["setpoint_period"] / 2))
-        if "dead_zone" in scaled:
-            scaled["dead_zone"] = min(scaled["dead_zone"], widest_zone)
         if name == "constant":
             scaled |= QUIET
-        samples = round(duration * case.samples)
-        first = round(duration * case.first)
         arguments = {**plant, "setpoint": "square", **scaled}
-        scaled_cases[name] = TuningCase(samples, first, arguments)
+        lengths = round(duration * case.samples), round(duration * case.first)
+        scaled_cases[name] = TuningCase(*lengths, arguments)
     return scaled_cases
 
 
-def middle(plant: Parameters, name: str) -> float:
-    """Return the middle of the range [low, high] of the argument `name` of a plant."""
-    return sum(plant.range_of(name)) / 2.0
+def amplitude_of(plant: Arguments) -> float:
+    """Return the amplitude of a plant's set points as a multiple of that of the paper's."""
+    return Parameters(**plant).setpoint_amplitude / PAPER.setpoint_amplitude
 
 
-def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> pd.DataFrame:
+def search(name: str, plant: Arguments, spans: Spans, count: int, folder: Path) -> pd.DataFrame:
     """Try `count` sets of gains of a controller, and return a table of the results of `score`.
 
     The trials are stored in `folder`, trial by trial. A search that starts again goes on after
-    the stored trials of the same controller, plant and number of runs, and tries the gains that
-    it would have tried without an interruption.
+    the stored trials of the same controller and plant, and tries the gains that it would have
+    tried without an interruption.
 
     Parameters
     ----------
@@ -261,10 +225,10 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
         Name of the controller.
     plant
         Arguments of the environment for the plant.
+    spans
+        Interval in which to search for each gain, by the gain's name.
     count
         Number of trials, with the stored trials.
-    runs
-        Number of runs of each case in a trial.
     folder
         Folder of the results.
     """
@@ -276,10 +240,9 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(
         storage=JournalStorage(JournalFileBackend(str(folder / "trials.log"))),
-        study_name=json.dumps([name, plant, runs]),
+        study_name=json.dumps([name, plant]),
         load_if_exists=True,
     )
-    spans = spans_of(name, plant)
     magnitudes: Any = {
         gain: optuna.distributions.FloatDistribution(abs(least), abs(most), log=True)
         for gain, (least, most) in spans.items()
@@ -297,7 +260,7 @@ def search(name: str, plant: Arguments, count: int, runs: int, folder: Path) -> 
         gains = {}
         for gain, magnitude in trial.params.items():
             gains[gain] = math.copysign(magnitude, spans[gain][0])
-        row = score(name, plant, runs, FIRST_RUN, gains)
+        row = score(name, plant, RUNS, FIRST_RUN, gains)
         trial.set_user_attr("row", row)
         study.tell(trial, row["objective"])
     return pd.DataFrame(
@@ -340,7 +303,7 @@ def score(
         medians[case_name] = float(np.median(mean_error(trajectory[case.first :])))
         if case_name == "constant":
             unsettled = 1.0 - float(settled(trajectory).mean())
-    penalty = PENALTY * Parameters(**plant).setpoint_amplitude / PAPER.setpoint_amplitude
+    penalty = PENALTY * amplitude_of(plant)
     objective = float(np.mean(list(medians.values()))) + penalty * unsettled
     return {**gains, **medians, "not converged": unsettled, "objective": objective}
 

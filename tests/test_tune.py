@@ -10,6 +10,7 @@ import pytest
 from agents import DirectNNController
 from agents.pi import SEARCHED_GAINS
 from benchmarks import tune
+from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.controllers.spans import NN_SPANS, PI_SPANS
@@ -38,14 +39,14 @@ def short(monkeypatch):
     monkeypatch.setattr(tune, "FINALISTS", 2)
     monkeypatch.setattr(tune, "STARTUP", 4)
     monkeypatch.setattr(tune, "FINAL_RUNS", 3)
+    monkeypatch.setattr(tune, "RUNS", 2)
     for name, case in tune.CASES.items():
         monkeypatch.setitem(tune.CASES, name, case._replace(samples=60, first=0))
 
 
-def search(out, trials=6, runs=2):
+def search(out, plant=""):
     """Run a search, and return its trials."""
-    words = f"pi --trials {trials} --runs {runs} --out {out}"
-    assert tune.main(words.split()) == 0
+    assert tune.main(f"pi --trials 6 --out {out} {plant}".split()) == 0
     return pd.read_csv(out / "trials.csv")
 
 
@@ -81,10 +82,8 @@ class TestOtherPlants:
             expected = Parameters(**tune.CASES[name].arguments)
             assert (case.samples, case.first) == tune.CASES[name][:2]
             assert Parameters(**case.arguments) == expected
-        assert tune.spans_of("pi", {}) == PI_SPANS
-        assert tune.spans_of("nn", {}) == NN_SPANS
 
-    def test_cases_and_spans_scale_with_the_plant(self):
+    def test_cases_scale_with_the_plant(self):
         cases = tune.cases(self.PLANT)
         learnt, quiet = (Parameters(**cases[name].arguments) for name in ("learnt", "constant"))
         assert (learnt.setpoint_amplitude, learnt.setpoint_period) == (10.4, 280)
@@ -93,15 +92,12 @@ class TestOtherPlants:
         assert cases["learnt"].samples == 1120
         assert cases["dead zone"].arguments["dead_zone"] == pytest.approx(3.9)
         assert cases["noise"].arguments["noise_variance"] == pytest.approx(0.8)
-        # Twice the gain, of the other sign: half the gains of the controller, likewise.
-        low, high = tune.spans_of("pi", self.PLANT)["kp"]
-        assert (low, high) == pytest.approx((-0.05, -5.0))
 
 
 def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path):
     plant = tmp_path / "plant.json"
     plant.write_text(json.dumps({"b": [0.0456, 0.00404]}))
-    words = f"pi --trials 3 --runs 2 --plant {plant} --out {tmp_path}/pi"
+    words = f"pi --trials 3 --plant {plant} --out {tmp_path}/pi"
     assert tune.main(words.split()) == 0
     file = tmp_path / "pi/gains.json"
     gains = json.loads(file.read_text())["gains"]
@@ -122,17 +118,15 @@ class TestSearch:
         assert len(trials) == 6
         assert trials["kp"].between(*PI_SPANS["kp"]).all()
         assert "The best" in capsys.readouterr().out
-        best, fixed = tables_of(tmp_path / "search/report.md")
-        assert len(best) == 2
-        for kp, ki, *_, objective, in_search in best:
+        (rows,) = tables_of(tmp_path / "search/report.md")
+        assert [row[0] for row in rows[:2]] == ["of the search"] * 2
+        assert [row[:3] for row in rows[2:]] == [
+            ["of PI (1992)", 2.2, 0.3], ["of PI (searched)", *SEARCHED_GAINS.values()],
+        ]  # fmt: skip
+        for _, kp, ki, *_, objective, _ in rows:
             assert objective == pytest.approx(final_objective(kp, ki), rel=1e-3)
+        for *_, in_search in rows[:2]:
             assert np.isclose(trials["objective"], in_search, rtol=1e-3).any()
-        assert [row[:4] for row in fixed] == [
-            ["PI (1992)", "the paper", 2.2, 0.3],
-            ["PI (searched)", "the search of version 0.1", *SEARCHED_GAINS.values()],
-        ]
-        for _, _, kp, ki, objective in fixed:
-            assert objective == pytest.approx(final_objective(kp, ki), rel=1e-3)
 
     def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch):
         uninterrupted, score, calls = search(tmp_path / "whole"), tune.score, []
@@ -145,12 +139,12 @@ class TestSearch:
 
         monkeypatch.setattr(tune, "score", score_or_stop)
         out = tmp_path / "parts"
-        assert tune.main(f"pi --trials 6 --runs 2 --out {out}".split()) == 130
+        assert tune.main(f"pi --trials 6 --out {out}".split()) == 130
         calls *= 2  # 10 calls: no further stop
-        search(out, runs=1)  # A search with other runs has no influence.
+        search(out, "--set delay=3")  # A search on another plant has no influence.
         before = len(calls)
         assert search(out).equals(uninterrupted)
-        assert len(calls) == before + 2 + 2 + 2  # 4 are kept; then 2 finalists, 2 fixed gains
+        assert len(calls) == before + 2 + 2 + 2  # 4 are kept; then 2 finalists, 2 present gains
 
 
 def test_the_pages_of_the_searches_name_the_gains_of_other_commands():
@@ -161,16 +155,31 @@ def test_the_pages_of_the_searches_name_the_gains_of_other_commands():
         assert {f"{value:g}" for value in values} <= set(re.findall(r"\d+(?:\.\d+)?", page))
 
 
-@pytest.mark.parametrize("name", tune.SPANS)
-def test_controllers_of_other_commands_have_the_gains_of_a_search(name, monkeypatch):
-    """The score of the gains is that of the controller itself."""
-    monkeypatch.setattr(tune, "FINAL_RUNS", 2)
-    constant = {"constant": tune.TuningCase(300, 0, {"setpoint": 4.8})}
-    monkeypatch.setattr(tune, "CASES", constant)
-    table = tune.fixed_gains(name, {})
-    for other, objective in zip(tune.FIXED_GAINS[name], table["objective"], strict=True):
-        case = tune.cases({})["constant"]
-        trajectory = ROSTER[other].run(case.arguments, 300, 2, tune.FINAL_FIRST_RUN)
-        unsettled = 1.0 - tune.settled(trajectory).mean()
-        error = np.median(tune.mean_error(trajectory))
-        assert float(objective) == pytest.approx(error + 5.0 * unsettled, rel=1e-3)
+@pytest.mark.usefixtures("short")
+@pytest.mark.parametrize("name", tune.PRESENT)
+def test_the_present_gains_are_those_of_the_controllers_themselves(name):
+    plant = KnownPlant(Parameters())
+    trials = pd.DataFrame([tune.score(name, {}, 2, 0, mid_gains(name, plant))])
+    gains = list(ROSTER[name].spans(plant))
+    table = tune.finals(name, {}, gains, trials).iloc[1:]
+    case = tune.cases({})["dead zone"]
+    for other, median in zip(tune.PRESENT[name], table["dead zone"], strict=True):
+        seed = tune.FINAL_FIRST_RUN + tune.SPACING_OF_CASES
+        trajectory = ROSTER[other].run(case.arguments, case.samples, 3, seed)
+        assert median == pytest.approx(np.median(tune.mean_error(trajectory)), rel=1e-12)
+
+
+def mid_gains(name, plant):
+    """Return gains in the middle of the intervals of a search."""
+    return {gain: sum(span) / 2 for gain, span in ROSTER[name].spans(plant).items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "gain", "span"), [("pi", "kp", (-0.05, -5.0)), ("nn", "weight_scale", (0.05, 2.0))]
+)
+def test_spans_scale_with_the_plant(name, gain, span):
+    spans = ROSTER[name].spans
+    assert spans(KnownPlant(Parameters())) == {"pi": PI_SPANS, "nn": NN_SPANS}[name]
+    # Twice the gain, of the other sign: half the gains of a controller, likewise.
+    twice = KnownPlant(Parameters(**TestOtherPlants.PLANT))
+    assert spans(twice)[gain] == pytest.approx(span)

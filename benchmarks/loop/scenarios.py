@@ -138,17 +138,6 @@ class PlantOptions:
         file = self.plant.stem if self.plant else None
         return ", ".join(filter(None, [self.preset, file, *self.set]))
 
-    def command_line(self) -> list[str]:
-        """Return the words of a command line that choose this plant: ["--preset", "hard"]."""
-        words: list[str] = []
-        if self.preset:
-            words += ["--preset", self.preset]
-        if self.plant:
-            words += ["--plant", str(self.plant)]
-        for argument in self.set:
-            words += ["--set", argument]
-        return words
-
     def cases(self, default: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
         """Return the cases of the chosen plant by name, or `default` if no plant is chosen.
 
