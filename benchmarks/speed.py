@@ -46,7 +46,7 @@ def work(options: Options) -> None:
     for n in ON_DEVICE if options.device else BATCHES:
         try:
             environments = make_environments(n, options.device)
-        except ValueError as error:
+        except RuntimeError as error:
             raise CommandError(f"--device: {error}") from error
         rounds = [
             {name: steps_a_second(env) for name, env in environments.items()}

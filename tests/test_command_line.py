@@ -73,7 +73,7 @@ REFUSED = {
     ],
     "datasets": [(["middlepoint/paper/ppo-v0"], 'Choose from: "middle')],
     "speed": [
-        (["--device", "toaster"], "--device: device must be a device that PyTorch can use"),
+        (["--device", "toaster"], "--device: Expected one of cpu, cuda"),
     ],
     "tune": [
         (["pi", "--set", "b=[0.1,-0.1]"], "--plant: a search for gains needs a stable plant"),
