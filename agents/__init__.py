@@ -3,7 +3,7 @@
 from agents.controller import Controller
 from agents.dahlin import DahlinController
 from agents.direct_nn import DirectNNController, Weights
-from agents.networks import Increments, PolicyNetwork
+from agents.networks import PolicyNetwork
 from agents.pi import PIController
 from agents.self_tuning import SelfTuningController
 from agents.smith import SmithPredictor
@@ -12,7 +12,6 @@ __all__ = [
     "Controller",
     "DahlinController",
     "DirectNNController",
-    "Increments",
     "PIController",
     "PolicyNetwork",
     "SelfTuningController",

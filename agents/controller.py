@@ -77,21 +77,6 @@ def flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def check_numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return real numbers as a float64 array of the same shape.
-
-    A ValueError that names the argument `name` is raised for anything else, such as text,
-    complex numbers or rows of unequal length.
-    """
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind in "biufO":  # neither text, which NumPy would parse, nor complex
-            return array.astype(np.float64, copy=False)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last from tensors
-        pass
-    raise ValueError(f"{name} must be numbers, got {value!r}")
-
-
 @dataclass(eq=False, kw_only=True)
 class Controller(ABC):
     """A controller of one control loop, or of a batch of independent control loops.
@@ -177,9 +162,15 @@ class Controller(ABC):
         Raises
         ------
         ValueError
-            If the controller does not fit the flow limits, the observations or the number of
-            the plants, or if `wrapped` is not empty.
+            If the controller does not fit the action form, the flow limits, the observations or
+            the number of the plants, or if `wrapped` is not empty.
         """
+        action_form = getattr(self, "action", "flow")
+        if parameters.action != action_form:
+            raise ValueError(
+                f"env must have action={action_form!r}, because policy returns such actions, "
+                f"got {parameters.action!r}"
+            )
         if (parameters.u_min, parameters.u_max) != (self.u_min, self.u_max):
             raise ValueError(
                 f"policy must have the flow limits of env, u_min={parameters.u_min}, "
@@ -228,7 +219,7 @@ class Controller(ABC):
             size than earlier observations since `reset`. A ValueError leaves the controller
             unchanged.
         """
-        values = check_numbers("observation", observation)
+        values = np.asarray(observation, np.float64)
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs or not len(values):
             raise ValueError(
                 f"observation must have shape (n_obs,) or (batch, n_obs), with n_obs of at "
@@ -247,7 +238,11 @@ class Controller(ABC):
         self.command = commands if is_batch else commands[0]
         if self._remembers:
             self._loop_shape = loop_shape
-        return float32_action(self.command, self.u_min, self.u_max, self._edge)[..., np.newaxis]
+        return self._action(self.command)[..., np.newaxis]
+
+    def _action(self, command: Values) -> NDArray[np.float32]:
+        """Return the actions that command the flows `command`, t/h, in the same shape."""
+        return float32_action(command, self.u_min, self.u_max, self._edge)
 
     @abstractmethod
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,20 +3,18 @@
 import itertools
 import json
 import pickle
-from contextlib import suppress
 from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents import (
     DahlinController,
     DirectNNController,
-    Increments,
     PIController,
     PolicyNetwork,
     SelfTuningController,
@@ -25,7 +23,7 @@ from agents import (
 )
 from agents.networks import PRETRAINED
 from benchmarks.loop.rollout import make_plants, rollout
-from mptc_gym import MiddlePointEnv, Parameters
+from mptc_gym import Parameters
 from tests.conftest import STEP_TEST, assert_the_seed_is_all_that_differs
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
@@ -71,20 +69,14 @@ def layers(*sizes):
 
 def policy(**arguments):
     """Return a policy with random layers, five inputs and these other arguments."""
-    defaults = {
-        "layers": layers(5, 7, 6, 1),
-        "observation": WINDOWS,
-        "input_scale": [0.2] * 3 + [1.0] * 2,
-    }
+    defaults = {"layers": layers(5, 7, 6, 1), "observation": WINDOWS}
     return PolicyNetwork(**defaults | arguments)
 
 
 def one_weight_policy(weight, bias, **arguments):
     """Return a policy whose output is `weight` e + `bias`, for the error e."""
     layer = np.array([[weight]]), np.array([bias])
-    return PolicyNetwork(
-        [layer], observation={"error_window": 1}, input_scale=[1.0], **arguments
-    )
+    return PolicyNetwork([layer], observation={"error_window": 1}, **arguments)
 
 
 @pytest.mark.parametrize(
@@ -115,14 +107,12 @@ def test_pi_by_hand(arguments, errors, commands):
         assert action == pytest.approx([2.0 * (u - low) / (high - low) - 1.0])
 
 
-BAD_OBSERVATIONS = [
-    np.zeros(3), np.zeros((2, 2, 6)), np.zeros((2, 6)), np.full(6, np.nan), "text", None,
-    ["1"] * 6, np.zeros(6) * 1j, [10**400] * 6, (np.zeros(6), {}),  # what `reset` returns
-]  # fmt: skip
+BAD_OBSERVATIONS = [np.zeros(3), np.zeros((2, 2, 6)), np.zeros((2, 6)), np.full(6, np.nan)]
 REFUSED = [  # arguments and wrappers of an environment, and the message of the error
     ({"u_max": 12.0}, "", r"u_max=12\.0, got -10\.0, 10\.0"),
     ({"setpoint_window": 2}, "", "newest error as element 3"),
     ({"error_window": 0}, "", "newest error as element 3"),
+    ({"action": "change"}, "", "must have action='flow'"),
     ({}, "FrameStack", "not be wrapped.*FrameStack"),
 ]
 
@@ -187,10 +177,15 @@ def test_some_controllers_refuse_more_plants():
         with pytest.raises(ValueError, match="num_envs=3, one loop per episode"):
             DirectNNController(num_envs=loops).check_environment(Parameters(), "", 3)
     network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
-    network.check_environment(Parameters(**network.observation), "", 5)
-    other = Parameters(**network.observation | {"output_window": 3})
-    with pytest.raises(ValueError, match="observations that policy expects"):
-        network.check_environment(other, "", 5)
+    another_dead_zone = network.interface | {"compensated_dead_zone": 7.0}
+    network.check_environment(Parameters(**another_dead_zone), "", 5)
+    for other, complaint in (
+        ({"output_window": 3}, "arguments of policy's training"),
+        ({"max_move": 0.4}, "arguments of policy's training"),
+        ({"action": "flow"}, "must have action='change'"),
+    ):
+        with pytest.raises(ValueError, match=complaint):
+            network.check_environment(Parameters(**network.interface | other), "", 5)
 
 
 class TestDirectNN:
@@ -352,22 +347,18 @@ def test_a_command_on_the_edge_of_the_dead_zone_has_an_effect():
     # float32(0.7) stands for less than 7 t/h.
     smith = SmithPredictor(**TUNED, dead_zone=7.0)
     smith.kp, smith.ki = 7.0, 0.0  # u = -7 at e = 1
-    network = one_weight_policy(-1e-12, 0.0, increments=Increments(0.4, dead_zone=7.0))
-    for controller, shown in ((smith, [0.0, 0, 0, 1.0]), (network, [1.0])):
-        assert np.float64(controller.act(shown)[0]) * 10.0 <= -7.0
+    assert np.float64(smith.act([0.0, 0, 0, 1.0])[0]) * 10.0 <= -7.0
 
 
 class TestPolicyNetwork:
-    @pytest.mark.parametrize("activation", ["elu", "relu", "silu", "tanh"])
-    def test_equals_torch(self, activation):
+    def test_equals_torch(self):
         torch = pytest.importorskip("torch")
-        network = policy(activation=activation)
+        network = policy(layers=[(W / 3.0, b / 3.0) for W, b in layers(5, 7, 6, 1)])
         x = np.random.default_rng(1).uniform(-2, 2, size=(50, 5))
-        function = getattr(torch.nn.functional, activation)
-        h = torch.tensor(np.float32(x) * network.input_scale)
+        h = torch.tensor(np.float32(x))
         for i, (W, b) in enumerate(network.layers):
             h = torch.nn.functional.linear(h, torch.tensor(W), torch.tensor(b))
-            h = function(h) if i < len(network.layers) - 1 else h
+            h = h.tanh() if i < len(network.layers) - 1 else h
         expected = h.clamp(-1.0, 1.0).numpy()
         assert np.abs(expected).min() < 0.9  # not all at the limits
         # PyTorch adds in another order; 1e-5 is some hundred roundings of float32.
@@ -378,46 +369,18 @@ class TestPolicyNetwork:
         assert network.act([[0.0]]) == pytest.approx(0.5)
         assert network.command == pytest.approx(5.0)  # three quarters of the way up
 
-    @settings(max_examples=30, deadline=None)
-    @given(
-        u_min=st.floats(-15, -0.5),
-        u_max=st.floats(0.5, 15),
-        dead_zone=st.floats(0, 12),
-        max_move=st.floats(0.01, 2),
-        outputs=st.lists(st.floats(-1.5, 1.5), min_size=1, max_size=12),
-    )
-    @example(u_min=-12.0, u_max=6.0, dead_zone=4.0, max_move=0.1, outputs=[0.1, 0.1])
-    @example(u_min=-12.0, u_max=3.0, dead_zone=4.0, max_move=1.0, outputs=[0.5, 1.0])
-    def test_increments_are_the_velocity_form_of_the_environment(
-        self, u_min, u_max, dead_zone, max_move, outputs
-    ):
-        increments = Increments(max_move, dead_zone)
-        network = one_weight_policy(1.0, 0.0, increments=increments, u_min=u_min, u_max=u_max)
-        form = {"max_move": max_move, "compensated_dead_zone": dead_zone}
-        plant = MiddlePointEnv(dead_zone=0.0, u_min=u_min, u_max=u_max, action="change", **form)
-        plant.reset(seed=0)
-        flow, most = 0.0, max_move * (u_max - u_min) / 2.0
-        for output in np.float32(outputs):
-            network.act([output])
-            command = plant.step(output[np.newaxis])[-1]["command"]
-            flow = np.clip(flow + most * np.clip(output, -1.0, 1.0), u_min, u_max)
-            # If the wanted flow is 0 apart from rounding, its sign is random.
-            if abs(flow) > 1e-5:
-                assert network.command == pytest.approx(command, abs=2e-5)
+    def test_an_action_is_a_change_of_the_flow_where_the_network_was_trained_so(self, rng):
+        limits = {"u_min": -4.0, "u_max": 8.0}
+        network = one_weight_policy(1.0, 0.0, action="change", max_move=0.3, **limits)
+        errors = rng.normal(size=(100, 1)).astype(np.float32)
+        np.testing.assert_array_equal(network.act(errors), errors.clip(-1.0, 1.0))
+        assert network.act([0.5]) == 0.5  # without memory, the batch size may change
+        assert network.command == pytest.approx(0.5 * 0.3 * 6.0)
 
-    def test_only_a_policy_without_increments_may_change_its_batch_size(self):
-        network, moving = (
-            one_weight_policy(0.0, 0.5),
-            one_weight_policy(0.0, 0.5, increments=Increments(0.8)),
-        )
-        for each in (network, moving):
-            each.act([[0.0], [0.0]])
-        network.act([[0.0]])
-        with pytest.raises(ValueError, match="since reset"):
-            moving.act([[0.0]])
-        for size in (4, 6):
-            with pytest.raises(ValueError, match=r"^observation must .*5[ ,]"):
-                policy().act(np.zeros(size))
+    @pytest.mark.parametrize("size", [4, 6])
+    def test_an_observation_of_another_size_is_refused(self, size):
+        with pytest.raises(ValueError, match=r"^observation must .*5[ ,]"):
+            policy().act(np.zeros(size))
 
     def test_files_with_wrong_settings_are_refused(self, tmp_path):
         path = tmp_path / "policy.npz"
@@ -426,7 +389,7 @@ class TestPolicyNetwork:
             PolicyNetwork.load(path, u_min=3.0, u_max=1.0)
         with np.load(path) as file:
             arrays = dict(file)
-        bad = {"format": 99, "layers": 2, "increments": {"step": 1}, "observation": 3}
+        bad = {"format": 1, "layers": 2, "action": "jump", "observation": 3}
         for name, value in bad.items():
             about = json.loads(str(arrays["about"])) | {name: value}
             np.savez(path, **{**arrays, "about": json.dumps(about)})
@@ -454,28 +417,21 @@ def test_saved_files_are_loaded_and_damaged_files_are_refused(tmp_path, kind):
     loaded = SAVED[kind].load(path)
     assert data_equivalence(vars(loaded), vars(SAVED[kind]), exact=True)
     data = path.read_bytes()
-    for kept in (0, 1, 20, 200, len(data) // 2, int(0.99 * len(data)), -1):
-        path.write_bytes(data[:kept])
+    damaged = data[:100] + bytes([data[100] ^ 0xFF]) + data[101:]  # of the first array
+    for content in (b"", data[:200], data[:-1], damaged):
+        path.write_bytes(content)
         with pytest.raises(ValueError, match=rf"kept\.npz holds no {kind}"):
-            SAVED[kind].load(path)
-    for place in np.linspace(0, len(data) - 1, 40, dtype=int):
-        damaged = bytearray(data)
-        damaged[place] ^= 0xFF
-        path.write_bytes(damaged)
-        with suppress(ValueError):  # not every damaged byte is read, so an error may be missing
             SAVED[kind].load(path)
 
 
 def test_nothing_in_a_foreign_file_is_executed(tmp_path, capsys):
     harm = np.array(Harm(), dtype=object)
     np.savez(tmp_path / "object.npz", about=harm, W=harm)
-    np.savez_compressed(tmp_path / "large.npz", W=np.zeros(2**23 + 1))
     np.save(tmp_path / "array.npy", np.zeros(3))
     (tmp_path / "pickle.npz").write_bytes(pickle.dumps(Harm()))
     for kind, saved in SAVED.items():
         for file in tmp_path.iterdir():
-            reason = "bytes, over 67,108,864" if file.stem == "large" else ""
-            with pytest.raises(ValueError, match=f"holds no {kind}, or is damaged: .*{reason}"):
+            with pytest.raises(ValueError, match=f"holds no {kind}, or is damaged: "):
                 saved.load(file)
         with pytest.raises(FileNotFoundError):
             saved.load(tmp_path / "missing.npz")
@@ -501,13 +457,10 @@ BAD = {
     ],
     policy: [
         ("observation", {"window": 5}), ("observation", {"output_window": 5.0}),
-        ("input_scale", [1.0] * 4), ("input_scale", [1.0] * 4 + [np.inf]),
-        ("input_scale", ["1"] * 5), ("input_scale", [1e39] * 5), ("activation", "elu "),
-        ("activation", ["elu"]), ("layers", []),
-        ("layers", layers(4, 3, 1)), ("layers", layers(5, 3, 2)),
+        ("action", "jump"), ("max_move", 0.0), ("compensated_dead_zone", np.nan),
+        ("layers", []), ("layers", layers(4, 3, 1)), ("layers", layers(5, 3, 2)),
         ("layers", [(np.full((1, 5), np.nan), np.zeros(1))]),
     ],
-    partial(Increments, max_move=1.0): [("max_move", -0.1), ("dead_zone", np.nan)],
 }  # fmt: skip
 
 

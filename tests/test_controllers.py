@@ -94,6 +94,19 @@ def test_a_copy_in_mid_episode_goes_on_like_the_original(member, copied):
         observations, *_ = plants.step(action)
 
 
+@pytest.mark.parametrize(
+    ("name", "preset", "compensated"),
+    [("ppo", "dead-zone-7", 7.0), ("ppo", "hard", 5.0), ("ppo-hard", "paper", 0.0)],
+)
+def test_a_policy_acts_where_the_dead_zone_of_the_plant_is_compensated(
+    name, preset, compensated
+):
+    # A range, as in `hard`, is not known before the run.
+    _, arguments = ROSTER[name].members()[0].start(PRESETS[preset], 1, 0)
+    assert (arguments["action"], arguments["max_move"]) == ("change", 2.0)
+    assert arguments["compensated_dead_zone"] == compensated
+
+
 def test_it_asks_for_its_own_windows(member):
     windows = {"setpoint_window": 7, "error_window": 0}
     assert errors(member, 1, 60, **windows) == errors(member, 1, 60)

@@ -14,7 +14,7 @@ from agents.networks import PRETRAINED
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.examples import sb3
-from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.rollout import make_plants
 from benchmarks.train import __main__ as program
 from benchmarks.train import ppo
 from tests.conftest import ROOT
@@ -76,10 +76,14 @@ class TestPPO:
 
     def test_each_group_has_a_seed_that_no_comparison_has(self):
         plants = ppo.begin(RECIPE, 0).get_env()
-        plants.reset()
-        seeds = {seed for batch in plants.batches for seed in batch.unwrapped.np_random_seed}
-        assert len(seeds) == 3
+        seeds = plants.seed(0)
+        assert [seeds.count(seed) for seed in sorted(set(seeds))] == [ppo.GROUP] * 3
         assert min(seeds) >= 1 << 32
+        # So the plants of a group do the same until their actions differ.
+        plants.reset()
+        rewards = plants.step(np.zeros((24, 1)))[1].reshape(3, ppo.GROUP)
+        assert (rewards == rewards[:, :1]).all()
+        assert len(set(rewards[:, 0])) == 3
 
     def test_what_a_group_has_in_common_is_no_advantage(self):
         model = ppo.begin(RECIPE, 0)
@@ -111,24 +115,19 @@ class TestExport:
         ("recipe", "scale"),  # of the action: with limits that matter
         [(RECIPE, 300.0), (replace(RECIPE, levels=True, hidden=(), dead_zone=0.0), 1.0)],
     )
-    def test_without_torch_it_does_what_it_does_in_its_training(self, recipe, scale):
+    def test_without_torch_it_acts_as_in_training(self, recipe, scale):
         model = ppo.begin(recipe, 5)
         with torch.no_grad():
             model.policy.action_net.weight.mul_(scale)
         network = ppo.export(model, recipe)
-        plant = {"setpoint": 5.0, "noise_variance": 0.5, **recipe.windows}
-        run = rollout(make_plants(3, 80, **plant), network, 80, seed=1)
-        form = {"max_move": ppo.MAX_MOVE, "compensated_dead_zone": recipe.dead_zone}
-        changing = make_plants(3, 80, action="change", **form, **plant)
-        observations, info = changing.reset(seed=1)
+        plants = make_plants(3, 80, setpoint=5.0, noise_variance=0.5, **network.interface)
+        observations, _ = plants.reset(seed=1)
         moves = []
-        for k in range(80):
-            np.testing.assert_allclose(run.output[k], info["output"], atol=1e-3)
-            seen = observations @ ppo.features(recipe).T
-            moves.append(model.predict(seen, deterministic=True)[0])
-            observations, *_, info = changing.step(moves[-1])
-            np.testing.assert_allclose(run.applied[k], info["applied"], atol=1e-3)
-        assert np.ptp(run.applied) > 1.0
+        for _ in range(80):
+            inputs = observations @ ppo.features(recipe).T
+            moves.append(model.predict(inputs, deterministic=True)[0])
+            np.testing.assert_allclose(network.act(observations), moves[-1], atol=1e-3)
+            observations, *_ = plants.step(moves[-1])
         assert (np.abs(moves).max() == 1.0) == (scale > 1.0)
 
 

@@ -239,16 +239,16 @@ def mpc(plant: KnownPlant, runs: int, seed: int) -> Agent:
 
 
 def ppo(plant: KnownPlant, runs: int, seed: int, training: str) -> tuple[Agent, Any]:
-    """Return a policy that was trained by PPO, and the observation that it needs.
+    """Return a policy that was trained by PPO, and the arguments of its environment.
 
-    `training` is the file of the network. A policy that was trained to compensate for a dead
-    zone compensates for the dead zone of `plant` instead, unless that is a range.
+    `training` is the file of the network. If a dead zone was compensated in the training, the
+    dead zone of `plant` is compensated instead, unless that is a range.
     """
     network = PolicyNetwork.load(PRETRAINED / training, **plant.limits)
-    increments = network.increments
-    if increments and increments.dead_zone and "dead_zone" not in plant.parameters.ranges:
-        network = replace(network, increments=replace(increments, dead_zone=plant.dead_zone))
-    return network, network.observation
+    interface = network.interface
+    if network.compensated_dead_zone and "dead_zone" not in plant.parameters.ranges:
+        interface["compensated_dead_zone"] = plant.dead_zone
+    return network, interface
 
 
 def _trained(pattern: str) -> list[str]:

@@ -8,25 +8,25 @@ training, and explains why the training is fast.
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, NoReturn, cast
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
-from agents import Increments, PolicyNetwork
+from agents import PolicyNetwork
 from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
 from benchmarks.lib.outputs import versions
 from benchmarks.lib.seeds import SEEDS
 from mptc_gym import PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import VALIDATION_SEED
-from mptc_gym.sb3 import GymnasiumVecEnv
+from mptc_gym.sb3 import make_vec_env
 
 Array = NDArray[np.float64]
 
@@ -52,9 +52,8 @@ class Recipe:
     # Arguments of the environment for each case of the validation, by name. No published result
     # uses these cases.
     cases: Mapping[str, Mapping[str, Any]]
-    # Half width of the dead zone that is compensated between policy and plant, t/h; 0 for no
-    # compensation. A comparison replaces a half width above 0 by the half width of the plant's
-    # dead zone, unless the plant's half width is a range.
+    # The environment's argument `compensated_dead_zone`, t/h. Unless it is 0, a comparison
+    # replaces it by the half width of the plant's dead zone, if that is not a range.
     dead_zone: float
     # Whether the policy's inputs include the set point and the flow, in addition to the error
     # and to changes of set point, temperature and flow.
@@ -189,7 +188,7 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
         policy = replace(policy, **KnownPlant(Parameters(**plant)).limits)
     validation = {}  # mean errors, degC
     for name, case in recipe.cases.items():
-        result = evaluate(policy, seed=VALIDATION_SEED, **recipe.windows, **case)
+        result = evaluate(policy, seed=VALIDATION_SEED, **{**policy.interface, **case})
         validation[name] = result.mean_error
     policy.provenance = {
         "algorithm": "PPO of Stable-Baselines3",
@@ -215,12 +214,13 @@ def begin(recipe: Recipe, seed: int) -> PPO:
     return make_ppo(Plants(recipe), seed, net_arch=layers)
 
 
-class Plants(GymnasiumVecEnv):
+class Plants(VecEnv):
     """The training plants of `recipe`, as a vector environment of Stable-Baselines3.
 
-    Each group of `GROUP` successive plants has one seed, so all plants of the group have the
-    same parameter values, noise and set points. An observation of `Plants` has the inputs of
-    the policy: an observation of `MiddlePoint-v0`, multiplied by the matrix that `features`
+    Plants of different kinds, such as calm and noisy plants, are in separate batches. Each
+    group of `GROUP` successive plants has one seed, so all plants of the group have the same
+    parameter values, noise and set points. An observation of `Plants` has the inputs of the
+    policy: an observation of `MiddlePoint-v0`, multiplied by the matrix that `features`
     returns.
 
     Parameters
@@ -230,22 +230,23 @@ class Plants(GymnasiumVecEnv):
     """
 
     def __init__(self, recipe: Recipe) -> None:
-        batches = []
-        for plants in recipe.plants:
-            batch = gymnasium.make_vec(
+        self.batches = [
+            make_vec_env(
                 "MiddlePoint-v0",
                 plants.number,
-                autoreset_mode="SameStep",
+                group=GROUP,
                 action="change",
                 max_move=MAX_MOVE,
                 compensated_dead_zone=recipe.dead_zone,
                 **recipe.windows,
                 **plants.arguments,
             )
-            batches.append(batch)
-        super().__init__(*batches, group=GROUP)
+            for plants in recipe.plants
+        ]
         self._features = features(recipe).T.astype(np.float32)
-        self.observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
+        observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
+        num_envs = sum(batch.num_envs for batch in self.batches)
+        super().__init__(num_envs, observation_space, self.batches[0].action_space)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set and return the seeds of the plants for the next reset.
@@ -254,11 +255,20 @@ class Plants(GymnasiumVecEnv):
         of controllers uses.
         """
         offset = int(np.random.SeedSequence(seed).generate_state(1)[0])  # below 2**32
-        return super().seed(TRAINING_SEEDS + offset)
+        seeds: list[int | None] = []
+        for batch in self.batches:
+            seeds += batch.seed(TRAINING_SEEDS + offset + len(seeds) // GROUP)
+        return seeds
 
     def reset(self) -> NDArray[Any]:
         """Reset all plants, and return the policy's inputs, shape (plants, inputs)."""
-        return super().reset() @ self._features
+        return np.concatenate([batch.reset() for batch in self.batches]) @ self._features
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Store actions of shape (plants, 1) for the next call of `step_wait`."""
+        ends = np.cumsum([batch.num_envs for batch in self.batches])
+        for batch, of_batch in zip(self.batches, np.split(actions, ends[:-1]), strict=True):
+            batch.step_async(of_batch)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all plants by the actions of `step_async`, as a `VecEnv` does.
@@ -266,11 +276,34 @@ class Plants(GymnasiumVecEnv):
         The returned observations, and the items "terminal_observation" of the infos, are inputs
         of the policy.
         """
-        observations, rewards, ended, infos = super().step_wait()
-        for i in np.flatnonzero(ended).tolist():
-            last_observation = infos[i]["terminal_observation"]
-            infos[i]["terminal_observation"] = last_observation @ self._features
-        return cast("Array", observations) @ self._features, rewards, ended, infos
+        returned = [batch.step_wait() for batch in self.batches]
+        observations, rewards, ended, infos = zip(*returned, strict=True)
+        all_infos = [info for infos_of_batch in infos for info in infos_of_batch]
+        all_ended = np.concatenate(ended)
+        for i in np.flatnonzero(all_ended).tolist():
+            last_observation = all_infos[i]["terminal_observation"]
+            all_infos[i]["terminal_observation"] = last_observation @ self._features
+        inputs_of_policy = np.concatenate(observations) @ self._features
+        return inputs_of_policy, np.concatenate(rewards), all_ended, all_infos
+
+    def close(self) -> None:
+        """Close the batches."""
+        for batch in self.batches:
+            batch.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return the value of an attribute for each plant; `indices` is ignored."""
+        return [value for batch in self.batches for value in batch.get_attr(attr_name)]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Return False for each plant."""
+        return [False] * self.num_envs
+
+    def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """Raise a NotImplementedError, as there are no single environments."""
+        raise NotImplementedError
+
+    set_attr = env_method
 
 
 def features(recipe: Recipe) -> Array:
@@ -310,7 +343,7 @@ def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
     return PolicyNetwork(
         layers,
         observation=recipe.windows,
-        input_scale=np.ones(sum(recipe.windows.values())),
-        activation="tanh",
-        increments=Increments(MAX_MOVE, recipe.dead_zone),
+        action="change",
+        max_move=MAX_MOVE,
+        compensated_dead_zone=recipe.dead_zone,
     )
