@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from copy import copy
-from typing import Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
@@ -15,12 +15,14 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
-from mptc_gym.environments.record import Record
 from mptc_gym.plant.checks import NOT_A_NUMBER, one_action, one_of, to_python
 from mptc_gym.plant.dynamics import Plant, WantedFlows, action_from_command
 from mptc_gym.plant.parameters import Parameters, full_signature, insert_table
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import ONLY_PLANT, Signals
+
+if TYPE_CHECKING:
+    from mptc_gym.rendering import Record
 
 EPISODE_STEPS = 1200  # samples after which the registered environments truncate an episode
 # The arguments that the `EnvSpec` of a batch has in addition to those of its plants.
@@ -238,13 +240,13 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     | `render_mode` | `render` |
     |---|---|
     | "rgb_array" | returns a picture, shape (540, 960, 3), uint8 |
-    | "human" | shows the picture in a window; `reset` and `step` call `render`, at most `metadata["render_fps"]` times a second |
+    | "human" | shows the picture in pygame's window; `reset` and `step` call `render`, at most `metadata["render_fps"]` times a second |
 
     The picture shows the latest 200 samples of the episode, or more if the delay is long. The
     upper panel of the picture shows the set point and the true temperature. The lower panel of
     the picture shows the commanded and the applied flow, the dead zone and the limits of the
-    flow, and the latest samples, whose flow has not reached the middle point yet. `render`
-    needs pygame: `pip install "mptc_gym[render]"`. Gymnasium's `RecordVideo` also needs
+    flow, and the latest samples, whose flow has not reached the middle point yet. Pictures
+    need pygame: `pip install "mptc_gym[render]"`. Gymnasium's `RecordVideo` also needs
     moviepy.
 
     ## Errors
@@ -252,7 +254,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     For an invalid argument or `render_mode`, the constructor raises a `ValueError` that names
     the argument. For an unknown argument, the constructor raises a `TypeError`. If an action is
     not one finite number, `step` raises a `ValueError` and leaves the plant unchanged. Without
-    pygame, `render` raises `DependencyNotInstalled` in an environment with a render mode.
+    pygame, `reset` raises `DependencyNotInstalled` in an environment with a render mode.
 
     ## Version history
 
@@ -317,6 +319,11 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         info : dict of float
             The info at sample k = 0, with the values that `reset` sampled for arguments that
             are ranges.
+
+        Raises
+        ------
+        DependencyNotInstalled
+            If the environment has a render mode, and pygame is not installed.
         """
         super().reset(seed=seed)
         if self._root is not self.np_random:  # at the first reset, or after a new seed
@@ -343,6 +350,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         self._window[output_index] = 0.0
         self._window[action_index] = rest_action
         if self.render_mode is not None:
+            from mptc_gym.rendering import Record  # which needs pygame
+
             self._record = Record(numbers, self.parameters.sampling_interval, setpoint)
         if self.render_mode == "human":
             self.render()
@@ -437,7 +446,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
                 info["disturbance"] = load
             info |= self._plant.factors
         if self._record is not None:
-            self._record.add(setpoint, output, command, applied)
+            self._record.add(info)
             if self.render_mode == "human":
                 self.render()
         return observation, reward, False, False, info
@@ -457,27 +466,25 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         ResetNeeded
             If the environment has a render mode, and `render` is called before the first
             `reset`.
-        DependencyNotInstalled
-            If the environment has a render mode, and pygame is not installed.
         """
         if self.render_mode is None:
             logger.warn(NO_RENDER_MODE)
             return None
         if self._record is None:
             raise ResetNeeded("call reset before render")
-        from mptc_gym.environments import drawing  # which needs pygame
+        from mptc_gym import rendering
 
         if self.render_mode == "rgb_array":
-            return drawing.frame(self._record)
-        drawing.show(self._record, self.metadata["render_fps"], self)
+            return rendering.frame(self._record)
+        rendering.show(self._record, self.metadata["render_fps"])
         return None
 
     def close(self) -> None:
-        """Close the picture window, unless another environment still uses the window."""
+        """Close the window, if this environment has shown pictures."""
         if self.render_mode == "human" and self._record is not None:
-            from mptc_gym.environments import drawing  # which needs pygame
+            import pygame
 
-            drawing.hide(self)
+            pygame.display.quit()
         self._record = None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from gymnasium import logger
@@ -14,13 +14,15 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.env import EPISODE_STEPS, NO_RENDER_MODE, Frame, MiddlePointEnv
-from mptc_gym.environments.record import Record
+from mptc_gym.env import EPISODE_STEPS, INFO, NO_RENDER_MODE, Frame, MiddlePointEnv
 from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_python
 from mptc_gym.plant.dynamics import PlantBatch, WantedFlows, action_from_command
 from mptc_gym.plant.parameters import full_signature
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
+
+if TYPE_CHECKING:
+    from mptc_gym.rendering import Record
 
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 
@@ -141,17 +143,15 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         ResetNeeded
             If the environment has a render mode, and `render` is called before the first
             `reset`.
-        DependencyNotInstalled
-            If the environment has a render mode, and pygame is not installed.
         """
         if self.render_mode is None:
             logger.warn(NO_RENDER_MODE)
             return None
         if not self._records:
             raise ResetNeeded("call reset before render")
-        from mptc_gym.environments import drawing  # which needs pygame
+        from mptc_gym import rendering
 
-        return tuple(map(drawing.frame, self._records.values()))
+        return tuple(map(rendering.frame, self._records.values()))
 
     def _advance(self, a: Values) -> tuple[Observations, Values, Mask, Mask, Infos]:
         """Move all plants by one sample, and return the results of a step that ends no episode.
@@ -179,11 +179,6 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             observed_error = setpoint - reading
         observations = self._window.add(setpoint, observed_error, reading, a)
         self._actions = a
-        if self._records:
-            columns = (values.tolist() for values in (setpoint, output, command, applied))
-            for i, sample in enumerate(zip(*columns, strict=True)):
-                self._records[i].add(*sample)
-
         mask = self._all_true.copy()
         infos = {  # written out entry by entry, which is faster than a loop
             "output": output.copy(),
@@ -205,6 +200,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         for name, factors in self._plants.factors.items():
             infos[name] = factors.copy()
             infos[f"_{name}"] = mask
+        if self._records:
+            columns = (infos[name].tolist() for name in INFO)
+            for i, values in enumerate(zip(*columns, strict=True)):
+                self._records[i].add(dict(zip(INFO, values, strict=True)))
         return observations, rewards, self._all_false.copy(), self._all_false.copy(), infos
 
     def _rewards(self, error: Values, a: Values) -> Values:
@@ -255,6 +254,8 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._actions[which] = rest_action
         self._window.reset(which, setpoint, rest_action)
         if self.render_mode is not None:
+            from mptc_gym.rendering import Record  # which needs pygame
+
             interval = self.parameters.sampling_interval
             for place, i in enumerate(which.tolist()):
                 numbers_of_plant = plant_numbers(numbers, place)

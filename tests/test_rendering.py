@@ -2,7 +2,6 @@
 
 import pickle
 import sys
-from dataclasses import replace
 from functools import partial
 from unittest.mock import Mock, call
 
@@ -12,156 +11,156 @@ import pygame
 import pytest
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, environments
-from mptc_gym.environments import drawing
-from mptc_gym.environments.record import Record
-from mptc_gym.plant.parameters import Parameters
+import mptc_gym
+from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, rendering
 from tests.conftest import MODES, NOISY, native_and_sync
 
-SHAPE = (540, 960, 3)
 UP = np.ones(1, np.float32)
-LEFT, TOP, WIDTH, _ = drawing.FLOWS
+LEFT, TOP, WIDTH, HEIGHT = rendering.FLOWS
 
 
-def record(*samples, sampling_interval=8.0, **numbers):
-    """Return a record of samples (y_d, y, u, u_a) of the paper's plant, or one unlike it."""
-    paper = Parameters().lowest
-    made = Record(replace(paper, **numbers), sampling_interval, 0.0)
-    for sample in samples:
-        made.add(*sample)
-    return made
+def picture_of(actions, **arguments):
+    """Return the picture after `actions`, of a plant without noise."""
+    env = MiddlePointEnv(render_mode="rgb_array", **arguments)
+    env.reset(seed=0)
+    for action in actions:
+        env.step(np.array([action]))
+    return env.render()
 
 
 @pytest.mark.parametrize(
-    ("delay", "dead_zone", "u_max"), [(18, 2.0, 10.0), (40, 8.0, 10.0), (0, 0.0, 5.0)]
+    ("delay", "dead_zone", "u_max", "span", "earlier_samples"),
+    [
+        (18, 2.0, 9.0, 200, 0),
+        (18, 2.0, 9.0, 200, 80),
+        (60, 8.0, 9.0, 240, 0),
+        (0, 0.5, 4.0, 200, 0),
+    ],
 )
-def test_curves_and_marks_are_where_the_axes_say(delay, dead_zone, u_max):
-    early, late = (-12.0, 12.0, 4.0, 0.0), (-12.0, -12.0, 100.0, u_max)
-    made = record(*[early] * 60, *[late] * 90, delay=delay, dead_zone=dead_zone, u_max=u_max)
-    picture = drawing.frame(made)
+def test_curves_and_areas_are_where_the_axes_say(
+    delay, dead_zone, u_max, span, earlier_samples
+):
+    arguments = {"delay": delay, "dead_zone": dead_zone, "u_min": -9.0, "u_max": u_max}
+    actions = [0.0] * earlier_samples + [0.9] * 60 + [-3.0] * 90
+    picture = picture_of(actions, setpoint=-12.0, b=[0.0], **arguments)
+    first = max(0, len(actions) - span)  # the sample at the left edge
 
-    def ends(colour, k):
-        """Return the highest and the lowest value with a colour, in the axes of its panel."""
-        (low, high), panel = made.flow_axis, drawing.FLOWS
-        if colour in (drawing.TEMPERATURE, drawing.SETPOINT):
-            (low, high), panel = made.temperature_axis, drawing.TEMPERATURES
-        found = np.flatnonzero(
-            (picture[:, round(LEFT + k / 200 * WIDTH)] == colour).all(axis=1)
-        )
-        found = found[(found > panel[1]) & (found < panel[1] + panel[3])]
-        return high - (found[[0, -1]] - panel[1]) / panel[3] * (high - low)
+    def values(panel, low, high, colour, k):
+        """Return the highest and the lowest value with a colour at sample k, in a panel."""
+        column = round(LEFT + (k - first) / span * WIDTH)
+        pixels = picture[panel.top + 1 : panel.bottom, column]
+        rows = np.flatnonzero((pixels == colour).all(axis=1)) + 1
+        return high - rows[[0, -1]] / panel.height * (high - low)
 
-    for k, sample in ((30.5, early), (100.5, late)):
-        colours = drawing.SETPOINT, drawing.TEMPERATURE, drawing.COMMAND, drawing.APPLIED
-        for colour, value in zip(colours, sample, strict=True):
-            shown = made.flow_axis[1] if value == 100.0 else value  # the edge of the panel
-            assert ends(colour, k) == pytest.approx(shown, abs=0.5)
-    for colour in (drawing.COMMAND, drawing.APPLIED):
-        assert np.ptp(ends(colour, 60)) > 2.0  # from u(59) to u(60), at once
-    assert ends(drawing.LIMIT, 195) == pytest.approx((u_max, -10.0), abs=0.2)
-    if dead_zone:
-        assert ends(drawing.DEAD_ZONE, 195) == pytest.approx((dead_zone, -dead_zone), abs=0.2)
-    columns = np.flatnonzero((picture[TOP + 10] == drawing.IN_TRANSIT).all(axis=1))
-    assert len(columns) == pytest.approx(delay / 200 * WIDTH, abs=3)
-    assert not delay or columns[-1] == pytest.approx(LEFT + 150 / 200 * WIDTH, abs=2)  # now
+    change, now = earlier_samples + 60, earlier_samples + 150
+    temperatures = partial(values, rendering.TEMPERATURES, -12.6, 0.6)
+    assert temperatures(rendering.SETPOINT, change) == pytest.approx(-12.0, abs=0.2)
+    assert temperatures(rendering.TEMPERATURE, change) == pytest.approx(0.0, abs=0.2)
+    margin = 0.12 * (u_max + 9.0)
+    flows = partial(values, rendering.FLOWS, -9.0 - margin, u_max + margin)
+    flow = 0.95 * (u_max + 9.0) - 9.0  # before the change
+    for k, command, applied in (-0.5, flow, flow), (0.5, -9.0 - margin, -9.0):
+        assert flows(rendering.COMMAND, change + k) == pytest.approx(command, abs=0.5)
+        assert flows(rendering.APPLIED, change + k) == pytest.approx(applied, abs=0.5)
+    assert np.ptp(flows(rendering.COMMAND, change)) > 2.0  # at once
+    assert flows(rendering.LIMIT, first + 1.5) == pytest.approx((u_max, -9.0), abs=0.2)
+    edges = dead_zone, -dead_zone
+    assert flows(rendering.DEAD_ZONE, first + 1.5) == pytest.approx(edges, abs=0.3)
+    in_transit = np.flatnonzero((picture[TOP + 5] == rendering.IN_TRANSIT).all(axis=1))
+    assert len(in_transit) == pytest.approx(delay / span * WIDTH, abs=3)
+    assert not delay or in_transit[-1] == pytest.approx(
+        LEFT + (now - first) / span * WIDTH, abs=2
+    )
 
 
-def test_what_is_written(monkeypatch):
-    texts, write = [], drawing.Panel.write
+def test_texts_have_numbers_and_do_not_overlap(monkeypatch):
+    places, write = {}, rendering.Panel.write
 
-    def noted(panel, text, *colours, **place):
-        texts.append((text.strip(), write(panel, text, *colours, **place)))
-        return texts[-1][1]
+    def noted(panel, text, *colours, **anchor):
+        place = write(panel, text, *colours, **anchor)
+        assert pygame.Rect(0, 0, *rendering.SIZE).contains(place)
+        assert place.collidelist([*places]) == -1
+        places[tuple(place)] = text.strip()
+        return place
 
-    monkeypatch.setattr(drawing.Panel, "write", noted)
-    drawing.draw(record(*[(5.0, -4.875, 4.0, 0.0)] * 32))
-    assert {text for text, _ in texts} >= {
-        "temperature -4.88 °C", "set point 5.00 °C", "error 9.88 °C", "time 4.27 min",
-        "applied flow 0.00 t/h", "command 4.00 t/h", "dead zone", "in transit", "20", "-10",
+    monkeypatch.setattr(rendering.Panel, "write", noted)
+    picture_of([0.4] * 31 + [-0.0001], sampling_interval=4.0, setpoint=4.875)
+    assert {*places.values()} >= {
+        "temperature 0.00 °C", "set point 4.88 °C", "error 4.88 °C", "time 2.13 min",
+        "applied flow 0.00 t/h", "command 0.00 t/h", "dead zone", "in transit", "5", "-10",
     }  # fmt: skip
-    # Ten minutes are 75 samples: under both panels, beside the 10 t/h.
-    places = [place for text, place in texts if text == "10"]
-    times = [place.centerx for place in places if place.left > LEFT]
-    assert times == [pytest.approx(LEFT + 75 / 200 * WIDTH, abs=1)] * 2
-    places = [place.inflate(8, 0) for _, place in texts]
-    for i, place in enumerate(places):
-        assert pygame.Rect(0, 0, *drawing.SIZE).contains(place)
-        assert place.collidelist(places[:i]) == -1
+    # Ten minutes are 150 samples: under both panels, beside the 10 t/h.
+    columns = [pygame.Rect(place).centerx for place, text in places.items() if text == "10"]
+    assert [x for x in columns if x > LEFT] == pytest.approx(
+        [LEFT + 150 / 200 * WIDTH] * 2, abs=1
+    )
 
 
 @pytest.mark.parametrize(
     ("low", "high", "ticks"),
     [
         (-10.0, 10.0, [-10.0, -5.0, 0.0, 5.0, 10.0]),
-        (0.0, 6.0, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
         (0.5, 12.5, [2.0, 4.0, 6.0, 8.0, 10.0, 12.0]),
         (0.0, 60.0, [0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0]),
         (0.0, 0.7, [0.0, 0.2, 0.4, 0.6]),
     ],
 )
 def test_numbers_at_an_axis_are_round_and_few(low, high, ticks):
-    assert drawing.ticks(low, high) == pytest.approx(ticks)
+    assert rendering.ticks(low, high) == pytest.approx(ticks)
 
 
-def test_a_large_value_is_written_in_few_digits(monkeypatch):
-    write = Mock(return_value=pygame.Rect(0, 0, 1, 1))
-    monkeypatch.setattr(drawing.Panel, "write", write)
-    drawing.draw(record((99999.0, -100000.0, 0.0, 0.0), (1e9, -1e9, -0.001, 0.0)))
-    texts = {each.args[0].strip() for each in write.mock_calls}
-    assert {"temperature -1e+09 °C", "set point 1e+09 °C", "command 0.00 t/h"} <= texts
-    write.reset_mock()
-    drawing.draw(record((99999.0, -100000.0, 0.0, 0.0)))
-    texts = {each.args[0].strip() for each in write.mock_calls}
-    assert {"set point 99999.00 °C", "temperature -1e+05 °C"} <= texts
+def test_an_unstable_plant_can_be_drawn_until_its_temperature_is_not_a_number():
+    with np.errstate(all="ignore"):
+        assert picture_of([1.0] * 1100, a=[1.0, -2.0]).shape == (540, 960, 3)
 
 
-def test_frames_stay_and_copies_in_the_middle_of_an_episode_draw_alike():
+def test_pictures_stay_and_copies_in_the_middle_of_an_episode_draw_alike():
     env = MiddlePointEnv(render_mode="rgb_array", **NOISY)
     env.reset(seed=0)
-    env.step(UP)
-    before, twin = env.render(), pickle.loads(pickle.dumps(env))
-    kept = before.copy()
-    assert (before.shape, before.dtype) == (SHAPE, np.uint8)
+    *_, info = env.step(UP)
+    before = env.render()
+    info["output"] = 1000.0  # the caller may do what it likes with the info
+    twin = pickle.loads(pickle.dumps(env))
+    unchanged = before.copy()
+    assert before.dtype == np.uint8
     env.step(UP)
     assert not np.array_equal(env.render(), before)
-    np.testing.assert_array_equal(before, kept)
+    np.testing.assert_array_equal(before, unchanged)
     np.testing.assert_array_equal(twin.render(), before)  # a record of its own
     twin.step(UP)
     np.testing.assert_array_equal(twin.render(), env.render())
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_frames_of_a_batch_are_those_of_one_after_the_other(mode, rng):
-    native, sync = native_and_sync(2, mode, 6, render_mode="rgb_array", **NOISY)
-    for envs in (native, sync):
+def test_pictures_of_a_batch_are_those_of_one_after_the_other(mode, rng):
+    batches = native_and_sync(2, mode, 6, render_mode="rgb_array", **NOISY)
+    for envs in batches:
         envs.reset(seed=5)
-    for k in range(9):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    for _ in range(8):
         actions = rng.uniform(-1, 1, (2, 1)).astype(np.float32)
-        _, _, _, ended, _ = native.step(actions)
-        sync.step(actions)
-        ours, theirs = native.render(), sync.render()
-        assert type(ours) is tuple
-        np.testing.assert_array_equal(ours, theirs)
-        mask = ended if mode == "Disabled" else np.array([k == 2, False])
-        if mask.any():  # one of them starts before the other
-            for envs in (native, sync):
-                envs.reset(options={"reset_mask": mask.copy()})
+        for envs in batches:
+            _, _, _, ended, _ = envs.step(actions)
+        native, sync = (envs.render() for envs in batches)
+        assert type(native) is tuple
+        np.testing.assert_array_equal(native, sync)
+        if mode == "Disabled" and ended.any():
+            for envs in batches:
+                envs.reset(options={"reset_mask": ended.copy()})
 
 
-def test_a_window_shows_what_a_frame_does_in_time_and_nothing_else_changes(monkeypatch, rng):
+def test_a_window_shows_the_picture_in_time_and_nothing_else_changes(monkeypatch, rng):
     clock = Mock()
-    monkeypatch.setattr(drawing, "clock", clock)
+    monkeypatch.setattr(rendering, "clock", clock)
     modes = "human", "rgb_array", None
     envs = [gymnasium.make("MiddlePoint-v0", render_mode=mode, **NOISY) for mode in modes]
-    returned = [each.reset(seed=0) for each in envs]
+    returned = [env.reset(seed=0) for env in envs]
     for action in rng.uniform(-1.5, 1.5, (6, 1)):
-        assert all(data_equivalence(each, returned[2], exact=True) for each in returned)
-        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
-        np.testing.assert_array_equal(shown, envs[1].render())
-        returned = [each.step(action) for each in envs]
+        assert all(data_equivalence(result, returned[2], exact=True) for result in returned)
+        window = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        np.testing.assert_array_equal(window, envs[1].render())
+        returned = [env.step(action) for env in envs]
     assert clock.tick.mock_calls == [call(30)] * 7
     assert envs[0].render() is None
     for other in (envs[1], *(MiddlePointEnv(render_mode=mode) for mode in modes)):
@@ -172,51 +171,17 @@ def test_a_window_shows_what_a_frame_does_in_time_and_nothing_else_changes(monke
     envs[0].close()
 
 
-@pytest.mark.parametrize("made", [MiddlePointEnv, partial(MiddlePointVectorEnv, 2)])
-def test_what_cannot_be_drawn_is_said(made, monkeypatch):
-    drawn = made(render_mode="rgb_array")
+@pytest.mark.parametrize("make", [MiddlePointEnv, partial(MiddlePointVectorEnv, 2)])
+def test_what_cannot_be_drawn_is_said(make, monkeypatch):
+    env = make(render_mode="rgb_array")
     with pytest.raises(ResetNeeded, match="before render"):
-        drawn.render()
-    env = made()
-    env.reset(seed=0), drawn.reset(seed=0)
+        env.render()
+    without_mode = make()
+    without_mode.reset(seed=0)
     with pytest.warns(UserWarning, match="render mode"):
-        assert env.render() is None
+        assert without_mode.render() is None
     monkeypatch.setitem(sys.modules, "pygame", None)  # not installed
-    monkeypatch.delitem(sys.modules, "mptc_gym.environments.drawing")
-    monkeypatch.delattr(environments, "drawing")
-    for draw in (drawn.render, MiddlePointEnv(render_mode="human").reset):
-        with pytest.raises(DependencyNotInstalled, match=r'pip install "mptc_gym\[render\]"'):
-            draw()
-
-
-def test_a_window_is_open_as_long_as_an_environment_shows_its_pictures():
-    first, second = (MiddlePointEnv(render_mode="human") for _ in range(2))
-    for env in (first, second):
+    monkeypatch.delitem(sys.modules, "mptc_gym.rendering")
+    monkeypatch.delattr(mptc_gym, "rendering")
+    with pytest.raises(DependencyNotInstalled, match=r'pip install "mptc_gym\[render\]"'):
         env.reset(seed=0)
-    first.close()
-    assert pygame.display.get_surface() is not None
-    second.step(np.zeros(1, np.float32))
-    second.close()
-    assert pygame.display.get_surface() is None
-
-
-anything = st.floats() | st.floats(-20, 20)
-
-
-@settings(max_examples=25, deadline=None)
-@given(
-    samples=st.lists(st.tuples(anything, anything, anything, anything), max_size=12),
-    delay=st.integers(0, 10) | st.sampled_from([10**3, 10**9]),
-    dead_zone=st.floats(0, 10),
-    limits=st.lists(st.floats(-1e9, 1e9), min_size=2, max_size=2, unique=True).map(sorted),
-    sampling_interval=st.floats(1e-3, 1e9),
-)
-def test_anything_can_be_drawn(samples, delay, dead_zone, limits, sampling_interval):
-    low, high = limits
-    made = record(
-        *samples, delay=delay, dead_zone=dead_zone, u_min=low, u_max=max(high, low + 1.0),
-        sampling_interval=sampling_interval,
-    )  # fmt: skip
-    assert drawing.frame(made).shape == SHAPE
-    for axis in (made.temperature_axis, made.flow_axis):
-        assert 2 <= len(drawing.ticks(*axis)) <= 8
