@@ -291,13 +291,13 @@ def _why_idle(travels: Values, parameters: Parameters) -> str:
     if travels.any():
         return ""
     low, high = parameters.range_of("dead_zone")
-    if high == 0.0:
+    if high == 0.0 or parameters.compensated_dead_zone > 0.0:
         return "the valve never moved"
     zone = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     return (
-        f"no action left the dead zone of {zone} t/h: score the policy in the interface of its "
-        "training, train it in mptc_gym.wrappers.IncrementalAction with "
-        "compensate_dead_zone=True, or choose larger actions"
+        f"no action left the dead zone of {zone} t/h: score the policy in the action form of "
+        f'its training, train it with action="change" and compensated_dead_zone={high:g}, or '
+        "choose larger actions"
     )
 
 

@@ -96,8 +96,11 @@ class TestEvaluate:
         result = evaluate(idle, "MiddlePointRandomised-v0", episodes=2)
         assert result.score == 0.0
         assert "no action left the dead zone of 3 to 7 t/h: score the policy in" in str(result)
+        assert 'train it with action="change" and compensated_dead_zone=7' in str(result)
         assert "dead zone of 5 t/h" in str(evaluate(idle, episodes=2))
         assert "the valve never moved" in evaluate(idle, episodes=2, dead_zone=0.0).note
+        form = {"action": "change", "compensated_dead_zone": 5.0}
+        assert evaluate(idle, episodes=2, **form).note == "the valve never moved"
         assert not evaluate(PIController(), episodes=2).note
 
     def test_help_explains_each_field(self):
@@ -150,8 +153,10 @@ class TestBounds:
         assert (stored["samples"], stored["seed"], stored["episodes"]) == (1200, SEED, 120)
         assert set(stored) >= {"command", "commit", "versions", "unit"}
 
-    def test_windows_and_rewards_change_no_bound(self):
-        other = evaluate(idle, episodes=2, action_window=9, reward="absolute", move_weight=0.1)
+    def test_windows_rewards_and_action_forms_change_no_bound(self):
+        others = {"action_window": 9, "reward": "absolute", "move_weight": 0.1}
+        form = {"action": "change", "max_move": 1.0, "compensated_dead_zone": 3.0}
+        other = evaluate(idle, episodes=2, **others, **form)
         assert other.least_possible == evaluate(idle, episodes=2).least_possible
 
     def test_a_case_is_found_by_its_arguments(self):

@@ -5,15 +5,21 @@ import re
 import runpy
 import sys
 from functools import partial
+from pathlib import Path
 
+import cyclopts
 import gymnasium
 import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
 import torch
+from scipy import signal
 from stable_baselines3 import PPO
 
 import mptc_gym.sb3
-from benchmarks.examples import recurrent
-from mptc_gym import evaluate
+from benchmarks.examples import fit_plant, recurrent
+from mptc_gym import MiddlePointEnv, evaluate
 from tests.conftest import ROOT
 
 
@@ -76,3 +82,65 @@ def test_the_notebook_runs_and_shows_what_it_showed(capsys, monkeypatch):
         assert printed[:4] == "".join(stored).splitlines()[:4]  # the lines before any training
     assert printed[4].startswith("PPO")
     plt.close("all")
+
+
+def bump_test(flow_before=0.0):
+    """Return the log of a plant that SciPy simulates, from rest with the flow `flow_before`."""
+    times = 4.0 * np.arange(400)
+    flow = np.repeat([8.0, 1.4, -6.0, 40.0, 8.0], 80)
+    applied = np.where(np.abs(flow) < 1.5, 0.0, np.minimum(flow, 30.0))
+    delayed = np.r_[flow_before, flow_before, applied[:-2]]  # by 8 s
+    lag = signal.lti([0.4], [50.0, 1.0])
+    rise = signal.lsim(lag, delayed - flow_before, times, interp=False)[1]
+    temperature = 60.0 + 0.4 * flow_before + rise
+    temperature += np.random.default_rng(5).normal(0.0, 0.05, 400)
+    return pd.DataFrame({"time": 100.0 + times, "flow": flow, "temperature": temperature})
+
+
+@pytest.mark.parametrize("flow_before", [0.0, 8.0])
+def test_a_bump_test_gives_the_plant_that_made_it(flow_before, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    bump_test(flow_before).to_csv("log.csv")
+    fit_plant.main(Path("log.csv"), dead_zone=1.5, u_min=-20.0, u_max=30.0)
+    plant = json.loads(Path("plant.json").read_text(encoding="utf-8"))
+    # A step response of the environment with these arguments.
+    arguments = {**plant, "delay": 0, "dead_zone": 0.0}
+    env = MiddlePointEnv(**arguments)
+    env.reset()
+    outputs = [env.step(np.float32([1.0]))[4]["output"] for _ in range(200)]
+    assert plant["delay"] == 2
+    assert [plant[name] for name in ("dead_zone", "u_min", "u_max")] == [1.5, -20.0, 30.0]
+    assert plant["sampling_interval"] == 4.0
+    assert outputs[-1] == pytest.approx(0.4 * 30.0, rel=0.01)
+    assert outputs[9] == pytest.approx(0.4 * 30.0 * (1.0 - np.exp(-0.8)), rel=0.02)
+    assert re.search(r"flow 0 (59\.9\d|60(\.0\d?)?) degC", capsys.readouterr().out)
+    assert plt.imread("plant.png").std() > 0.0
+    plt.close("all")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda log: log.rename(columns={"flow": "valve"}), r"columns.*not found.*'flow'"),
+        (lambda log: log.replace({"time": {140.0: "noon"}}), "could not convert.*noon"),
+        (lambda log: log.drop(10), "equidistant, but 144 s comes 8 s after .* most times 4 s"),
+        (lambda log: log.assign(flow=np.clip(log.flow, -1.0, 1.0)), "outside of the dead zone"),
+    ],
+)
+def test_a_log_that_cannot_be_fitted_is_refused(change, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    change(bump_test()).to_csv("log.csv")
+    with pytest.raises(SystemExit, match=message):
+        fit_plant.main(Path("log.csv"), dead_zone=1.5, u_min=-20.0, u_max=30.0)
+
+
+@pytest.mark.parametrize("missing", ["dead-zone", "u-min", "u-max"])
+def test_a_fit_asks_for_dead_zone_and_limits(missing, capsys):
+    numbers = {"dead-zone": 1.5, "u-min": -20.0, "u-max": 30.0}
+    del numbers[missing]
+    words = [f"--{name}={number}" for name, number in numbers.items()]
+    app = cyclopts.App()
+    app.default(fit_plant.main)
+    with pytest.raises(SystemExit):
+        app([__file__, *words])
+    assert f"--{missing} requires an argument" in capsys.readouterr().err

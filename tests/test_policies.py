@@ -36,6 +36,7 @@ EPISODES = 3
 N = 2  # plants of a vector environment, which therefore runs two rounds of episodes
 # Without a dead zone, every action matters.
 SHORT = {"dead_zone": 0.0, "max_episode_steps": LENGTH}
+CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 4.0}
 
 
 # Environments
@@ -242,6 +243,7 @@ ENVIRONMENTS = {
         lambda: wrappers.TimeLimit(MiddlePointEnv(noise_variance=0.5, dead_zone=0.0), LENGTH),
         one,
     ),
+    "changes": (make := partial(one, **CHANGE), make),
     "random plants": (make := partial(one, delay=[2, 9]), make),
     "batch": (many, one),
     "batch, SameStep": (partial(many, autoreset_mode="SameStep"), one),
@@ -323,7 +325,9 @@ TRAININGS = {
     "one": (one, one),
     "windows": (make := partial(one, action_window=3, error_window=0, output_window=2), make),
     "Monitor": (lambda: dummy(lambda: Monitor(one())), one),
-    "batch": (lambda: batch(action_window=3), lambda: one(action_window=3)),
+    "batch": (partial(batch, action_window=3), partial(one, action_window=3)),
+    "changes": (partial(batch, **CHANGE), partial(one, **CHANGE)),
+    "changes of one": (partial(one, **CHANGE), partial(one, **CHANGE)),
     "processes": (processes, one),
     "VecNormalize": (lambda: trained(VecNormalize(batch())), one),
     "VecFrameStack": (lambda: VecFrameStack(dummy(), 2), stacked),
@@ -439,6 +443,11 @@ REFUSED = {
         "setpoint_window=3, output_window=3, got setpoint_window=6, output_window=0"),
     "VecNormalize forgotten": lambda _: (
         model_of(trained(VecNormalize(dummy()))), dummy, "normalised=True, got normalised=F"),
+    "action form forgotten": lambda _: (
+        model_of(batch(**CHANGE)), one, "action=change, max_move=0.3, .* got action=flow"),
+    "another dead zone": lambda _: (
+        model_of(batch(**CHANGE)), partial(one, **CHANGE | {"compensated_dead_zone": 0.0}),
+        "compensated_dead_zone=4.0, got compensated_dead_zone=0.0"),
     "frames forgotten": lambda _: (
         model_of(VecFrameStack(dummy(), 2)), dummy, r"spaces of .*load\(path, env=...\)"),
     "windows of a file": lambda folder: (

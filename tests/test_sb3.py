@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.error import Error
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.wrappers import FlattenObservation
 from sb3_contrib import RecurrentPPO
@@ -28,10 +29,9 @@ from torch.nn.utils import parameters_to_vector
 from mptc_gym import evaluate
 from mptc_gym.evaluation import VALIDATION_SEED
 from mptc_gym.sb3 import GymnasiumVecEnv, ScoreCallback, make_vec_env
-from mptc_gym.wrappers import IncrementalAction
 
 HARD = "MiddlePointHard-v0"
-INCREMENTS = {"max_move": 0.3, "compensate_dead_zone": True}
+CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 5.0}
 TRAINING = {"action_window": 20, "setpoint": "random", "reward": "absolute"}
 SHORT = {"setpoint": "random", "setpoint_period": 20, "max_episode_steps": 30}
 # Numbers and arguments of the plants in two batches.
@@ -56,16 +56,15 @@ def model_of(plants, **arguments):
 
 
 class TestBatches:
-    @pytest.mark.parametrize("kind", ["wrapped", "two"])
+    @pytest.mark.parametrize("kind", ["changes", "two"])
     def test_they_equal_dummy_vec_env(self, kind, rng):
         if kind == "two":
             batch = two_batches()
             makers = [partial(one, **arguments) for n, arguments in TWO_KINDS for _ in range(n)]
         else:
-            arguments = {**TRAINING, "max_episode_steps": 7}
-            wrapper = partial(IncrementalAction, **INCREMENTS)
-            batch = make_vec_env(HARD, 4, wrapper=wrapper, **arguments)
-            makers = [lambda: wrapper(gymnasium.make(HARD, **arguments))] * 4
+            arguments = {**TRAINING, **CHANGE, "max_episode_steps": 7}
+            batch = make_vec_env(HARD, 4, **arguments)
+            makers = [partial(gymnasium.make, HARD, **arguments)] * 4
         dummy = DummyVecEnv([lambda make=make: Monitor(make()) for make in makers])
         batch.seed(3)
         dummy.seed(3)
@@ -121,16 +120,13 @@ class TestBatches:
             two_batches("NextStep")
 
     def test_bad_arguments_are_named(self):
-        for message, arguments in {
-            "n_envs must be an integer from 1": {"n_envs": 0},
-            "group must be an integer from 1": {"group": 2},
-            "seed must be an integer from 0": {"seed": "a"},
-            "max_move must be": {"wrapper": {"max_move": 7}},
-            "env must be of this pack": {"env": FlattenObservation(one()).spec},
-            "wrapper must be arguments of Incr": {"wrapper": {"maxmove": 1.0}},
-            "wrapper must be IncrementalAction, or": {"wrapper": "IncrementalAction"},
-        }.items():
-            with pytest.raises(ValueError, match=message):
+        for error, message, arguments in [
+            (ValueError, "num_envs must be an integer from 1", {"n_envs": 0}),
+            (ValueError, "max_move must be", {"max_move": 7}),
+            (Error, "additional_wrappers", {"env": FlattenObservation(one()).spec}),
+            (Error, "Environment `Point` doesn't exist", {"env": "Point-v0"}),
+        ]:
+            with pytest.raises(error, match=message):
                 make_vec_env(**arguments)
 
 
@@ -223,7 +219,7 @@ class TestScoreCallback:
 
     def test_errors_come_before_a_training(self):
         model = model_of(make_vec_env(HARD, 2))
-        with pytest.raises(gymnasium.error.Error, match="MiddlePointHard-v00"):
+        with pytest.raises(Error, match="MiddlePointHard-v00"):
             model.learn(64, ScoreCallback("MiddlePointHard-v00"))
         model = model_of(Unknown(make_vec_env(HARD, 2)))
         with pytest.raises(ValueError, match="Unknown, which cannot be made again"):

@@ -4,6 +4,7 @@ import copy
 import gc
 import pickle
 from collections import defaultdict
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -16,79 +17,106 @@ from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from mptc_gym import PRESETS, MiddlePointVectorEnv  # noqa: E402
+from mptc_gym import PRESETS, MiddlePointVectorEnv, torch_env  # noqa: E402
 from mptc_gym.plant.dynamics import action_from_command, float32_action  # noqa: E402
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams  # noqa: E402
 from mptc_gym.plant.signals import Signals  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv, make_vec  # noqa: E402
-from mptc_gym.wrappers import IncrementalAction  # noqa: E402
 from tests.conftest import MODES, random_actions, valid_arguments  # noqa: E402
+
+HARD = PRESETS["hard"]
+ALL_SHOWN = {"action_window": 4, "output_window": 2, "move_weight": 0.1}
+CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 5.0}
 
 
 def make(num_envs=2, **arguments):
     return MiddlePointTorchEnv(num_envs, **{"dtype": torch.float64, **arguments})
 
 
-def signals_of(envs, seed, *, episodes, samples):
-    """Return signals and plant numbers of an environment in NumPy, as external signals."""
-    parameters, n = envs.parameters, envs.num_envs
-    signals, sampler = Signals.of(parameters, n, samples), PlantSampler(parameters)
-    streams = [RandomStreams.of_seed(seed + i) for i in range(n)]
-    values_by_name = defaultdict(list)
-    for _ in range(episodes):
-        numbers = sampler.sample(streams)
-        first = {"setpoint": signals.reset(np.arange(n), streams, numbers)}
-        for name, signal in signals._asdict().items():
-            if signal is not None:
-                rows = [signal.next().copy() for _ in range(samples)]
-                values_by_name[name].append([first.get(name, np.zeros(n)), *rows])
-        for name, values in numbers.select(parameters.ranges).items():
-            values_by_name[name].append(values)
-    return {name: torch.tensor(np.array(values)) for name, values in values_by_name.items()}
+class Replayed(MiddlePointTorchEnv):
+    """An environment in PyTorch with the random numbers of NumPy."""
+
+    def use(self, seed, *, episodes, samples):
+        """Take signals and parameter values of `episodes` episodes from NumPy."""
+        n, parameters = self.num_envs, self.parameters
+        signals, sampler = Signals.of(parameters, n, samples), PlantSampler(parameters)
+        streams = [RandomStreams.of_seed(seed + i) for i in range(n)]
+        replay = defaultdict(list)
+        for _ in range(episodes):
+            numbers = sampler.sample(streams)
+            setpoint = signals.reset(np.arange(n), streams, numbers)
+            for name, signal in signals._asdict().items():
+                if signal is not None:
+                    first = setpoint if name == "setpoint" else np.zeros(n)
+                    rows = [signal.next().copy() for _ in range(samples)]
+                    replay[name].append([first, *rows])
+            for name, values in numbers.select(parameters.ranges).items():
+                replay[name].append(values)
+        self.replay = {name: torch.tensor(np.array(values)) for name, values in replay.items()}
+        self.episodes = torch.full((n,), -1)
+        for name in self._signals:
+            if name != "setpoint" or parameters.setpoint == "random":
+                self._signals[name] = ReplayedSignal(self, name)
+
+    def now(self, name, *index):
+        values = self.replay[name][(self.episodes, *index, range(self.num_envs))]
+        return values.to(self.dtype)
+
+    def _begin(self, mask):
+        self.episodes += torch.tensor(mask)
+        draws = [self.now(name) for name in self.parameters.ranges]
+        with mock.patch.object(torch_env, "_uniform", side_effect=draws):
+            return super()._begin(mask)
 
 
-def assert_close(ours, theirs, name, rtol, atol):
+class ReplayedSignal:
+    def __init__(self, env, name):
+        self.env, self.name = env, name
+
+    def reset(self, mask, age, numbers):
+        return self.env.now(self.name, 0)
+
+    def next(self, samples, age):
+        last = self.env.replay[self.name].shape[1] - 1  # steps that reset may lead beyond it
+        return self.env.now(self.name, (age + torch.arange(samples)[:, None]).clamp(max=last))
+
+    def advance(self):
+        pass
+
+
+def assert_close(ours, theirs, rtol, atol, name=""):
+    if isinstance(theirs, tuple):
+        ours, theirs = dict(enumerate(ours)), dict(enumerate(theirs))
     if isinstance(theirs, dict):
-        assert set(ours) == set(theirs)
+        assert ours.keys() == theirs.keys()
         for key in theirs:
-            assert_close(ours[key], theirs[key], key, rtol, atol)
+            assert_close(ours[key], theirs[key], rtol, atol, key)
         return
     if name == "final_obs":
         none = np.zeros(ours.shape[1:])
         theirs = np.array([none if each is None else each for each in theirs], np.float32)
-    if theirs.dtype == np.float32:  # half a unit in the last place
-        rtol = max(rtol, 6e-8)
     ours = ours.detach().numpy()
-    assert ours.shape == theirs.shape
-    assert (ours.dtype == bool) == (theirs.dtype == bool)
-    if ours.dtype == bool:
-        assert (ours == theirs).all(), name
-    elif not (np.abs(ours - theirs) <= atol + rtol * np.abs(theirs)).all():  # or NaN: slower
-        np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=atol, err_msg=name)
+    assert (ours.shape, ours.dtype == bool) == (theirs.shape, theirs.dtype == bool), name
+    bounds = atol + rtol * np.abs(theirs)
+    assert (np.abs(ours - 1.0 * theirs) <= bounds).all(), (name, ours, theirs)
 
 
-def compare(env, envs, *, steps, rng, partial_resets, limit, rtol=1e-9, atol=1e-9):
-    """Compare both environments on the same signals and actions."""
-
-    def checked(ours, theirs):
-        for own, other in zip(ours, theirs, strict=True):
-            assert_close(own, other, "", rtol, atol)
-        return theirs
-
-    n, seed = envs.num_envs, int(rng.integers(2**30))
-    masks = rng.random((steps, n)) < partial_resets
-    limit = steps if limit is None else limit
-    episodes = 2 + masks.sum(axis=0).max() + steps // limit
-    signals = signals_of(envs, seed, episodes=episodes, samples=min(limit, steps))
-    checked(env.reset(options={"signals": signals}), envs.reset(seed=seed))
+def assert_equals_numpy(n, rng, steps, partial_resets, tolerances, own, **shared):
+    """Compare both environments with the same random numbers and actions."""
+    env, envs = Replayed(n, **own, **shared), MiddlePointVectorEnv(n, **shared)
+    seed, masks = int(rng.integers(2**30)), rng.random((steps, n)) < partial_resets
+    length = min(steps, shared["max_episode_steps"] or steps)
+    env.use(seed, episodes=2 + masks.sum(axis=0).max() + steps // length, samples=length)
+    assert_close(env.reset(), envs.reset(seed=seed), *tolerances)
     for mask in masks:
         actions = random_actions(rng, n)
-        truncated = checked(env.step(torch.tensor(actions)), envs.step(actions))[3]
+        theirs = envs.step(actions)
+        assert_close(env.step(torch.tensor(actions)), theirs, *tolerances)
         if envs.autoreset_mode is AutoresetMode.DISABLED:
-            mask |= truncated
+            mask |= theirs[3]
         if mask.any():
             ours = env.reset(options={"reset_mask": torch.tensor(mask)})
-            checked(ours, envs.reset(options={"reset_mask": mask}))
+            assert_close(ours, envs.reset(options={"reset_mask": mask}), *tolerances)
 
 
 @settings(max_examples=20, deadline=None)
@@ -104,46 +132,77 @@ def compare(env, envs, *, steps, rng, partial_resets, limit, rtol=1e-9, atol=1e-
 def test_it_equals_the_environment_in_numpy(
     arguments, num_envs, mode, limit, partial_resets, differentiable, randomness
 ):
-    rng = np.random.default_rng(randomness)
-    shell = {"max_episode_steps": limit, "autoreset_mode": mode}
-    env = make(num_envs, differentiable=differentiable, **shell, **arguments)
-    envs = MiddlePointVectorEnv(num_envs, **shell, **arguments)
-    compare(env, envs, steps=50, rng=rng, partial_resets=partial_resets, limit=limit)
+    # In NumPy, a command for a change that is rounded into the dead zone is moved to its edge.
+    # Observations are float32 in NumPy.
+    tolerances = (3e-5, 3e-5) if arguments.get("action") == "change" else (6e-8, 1e-9)
+    assert_equals_numpy(
+        num_envs, np.random.default_rng(randomness), 50, partial_resets, tolerances,
+        {"dtype": torch.float64, "differentiable": differentiable},
+        max_episode_steps=limit, autoreset_mode=mode, **arguments,
+    )  # fmt: skip
 
 
 # float32 has 24 bits. Errors of rounding grow with the slowest pole's time constant of some 20
 # samples, and temperatures are some 10 degC: 10 * 20 * 2^-24 = 1e-5.
+@pytest.mark.parametrize("form", [{}, CHANGE])
 @pytest.mark.parametrize(
-    ("dtype", "rtol", "atol"), [(torch.float64, 1e-9, 1e-9), (torch.float32, 1e-5, 1e-4)]
+    ("dtype", "tolerances"), [(torch.float64, (6e-8, 1e-9)), (torch.float32, (1e-5, 1e-4))]
 )
-def test_it_equals_it_over_long_episodes_in_both_types(dtype, rtol, atol, rng):
-    plant = {"action_window": 20, "output_window": 2, "move_weight": 0.1, **PRESETS["hard"]}
-    arguments = {"max_episode_steps": 400, "autoreset_mode": "SameStep", **plant}
-    env, envs = make(3, dtype=dtype, **arguments), MiddlePointVectorEnv(3, **arguments)
-    tolerances = {"rtol": rtol, "atol": atol}
-    compare(env, envs, steps=600, rng=rng, partial_resets=0.002, limit=400, **tolerances)
+def test_it_equals_it_over_long_episodes_in_both_types(dtype, tolerances, form, rng):
+    assert_equals_numpy(
+        3, rng, 600, 0.002, tolerances, {"dtype": dtype},
+        max_episode_steps=400, autoreset_mode="SameStep", **ALL_SHOWN, **HARD, **form,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_command_on_the_edge_of_the_dead_zone_passes(rng, dtype):
-    # Of plants with limits of their own.
-    n, ranges = 600, {"dead_zone": [0.1, 5]}
-    envs, env = MiddlePointVectorEnv(n, **ranges), make(n, dtype=dtype, **ranges)
-    _, infos = envs.reset(seed=int(rng.integers(2**30)))
-    drawn = {name: infos[name] for name in ranges}
-    env.reset(options={"signals": {k: torch.tensor(each) for k, each in drawn.items()}})
-    commands = rng.choice([-1, 1], n) * drawn["dead_zone"]
+    env = make(600, dtype=dtype, dead_zone=[0.1, 5])
+    zones = env.reset(seed=0)[1]["dead_zone"].double().numpy()
+    commands = rng.choice([-1, 1], 600) * zones
     exact = action_from_command(commands, -10.0, 10.0)
-    for actions in (exact[:, None], float32_action(commands, -10.0, 10.0, **drawn)[:, None]):
-        for applied in (env.step(torch.tensor(actions)), envs.step(actions)):
-            np.testing.assert_allclose(applied[-1]["applied"], commands, rtol=0, atol=1e-5)
+    for actions in (exact, float32_action(commands, -10.0, 10.0, zones)):
+        infos = env.step(torch.tensor(actions)[:, None])[-1]
+        np.testing.assert_allclose(infos["applied"], commands, rtol=0, atol=1e-5)
+
+
+def test_draws_have_the_distributions_of_numpy(rng):
+    n = 10_000
+    arguments = {**HARD, "setpoint_period": 90, "delay": [12, 24]}
+    samples = []
+    for env, zeros in (
+        (MiddlePointVectorEnv(n, **arguments), np.zeros((n, 1))),
+        (MiddlePointTorchEnv(n, **arguments), torch.zeros(n, 1)),
+    ):
+        infos = env.reset(seed=0)[1]
+        values = {f"{name} at 0": infos[name] for name in (*env.parameters.ranges, "setpoint")}
+        for k in range(1, 41):
+            observations, *_, infos = env.step(zeros)
+            if k in (1, 2, 40):
+                names = ("setpoint", "noise", "disturbance", "gain_factor", "output")
+                values |= {f"{name} at {k}": infos[name] for name in names}
+                values[f"reading at {k}"] = infos["setpoint"] - observations[:, 3]
+        samples.append(
+            {name: np.asarray(value).astype(float) for name, value in values.items()}
+        )
+    theirs, ours = samples
+    assert ours.keys() == theirs.keys()
+    for name in theirs:
+        for power in (1, 2):  # mean and variance
+            means = [(each[name] - theirs[name].mean()) ** power for each in samples]
+            difference = abs(means[0].mean() - means[1].mean())
+            assert difference <= 5 * (2 / n) ** 0.5 * means[0].std(), name
+        for share in (0.01, 0.99):
+            percentile = np.quantile(theirs[name], share)
+            shares = [(each[name] <= percentile).mean() for each in samples]
+            assert abs(shares[0] - shares[1]) <= 5 * (2 * share * (1 - share) / n) ** 0.5, name
 
 
 class TestGradients:
     @pytest.mark.parametrize("plant", [
         {"dead_zone": 0.0, "action_window": 2}, {"delay": [2, 4], "gain_factor": [0.5, 2]},
-        {**PRESETS["hard"], "delay": 2, "dead_zone": 1.0, "action_window": 3,
-         "output_window": 2, "move_weight": 0.1, "u_min": -12.0},
+        {**HARD, **ALL_SHOWN, "delay": 2, "dead_zone": 1.0, "u_min": -12.0},
+        {**HARD, **ALL_SHOWN, **CHANGE, "delay": 2, "dead_zone": 1.0, "max_move": 0.05},
     ])  # fmt: skip
     def test_it_is_that_of_differences_away_from_the_kinks(self, plant):
         env = make(2, **{"delay": 2, "output_window": 1, "differentiable": True, **plant})
@@ -157,6 +216,10 @@ class TestGradients:
         # Well inside what the actuator passes, and far from the same action twice.
         size = torch.linspace(0.55, 0.8, 24, dtype=torch.float64).reshape(12, 2, 1)
         actions = size * torch.tensor([1.0, -1.0]).repeat(6)[:, None, None]
+        if env.parameters.action == "change":
+            actions = actions.abs()  # the flow stays far from 0
+            # Differences cannot be taken of commands that are rounded to float32.
+            env._wanted_flows._rounded_actions = lambda command: command / 10.0
         assert torch.autograd.gradcheck(returned, actions.requires_grad_(), fast_mode=True)
 
     def test_it_goes_straight_through_the_dead_zone_and_ends_at_the_limits(self):
@@ -166,42 +229,42 @@ class TestGradients:
         actions = torch.tensor([[0.3], [0.7], [-0.5], [1.2], [-3.0]], requires_grad=True)
         infos = env.step(actions)[-1]
         assert infos["applied"].tolist() == pytest.approx([0.0, 7.0, -5.0, 10.0, -10.0])
-        infos["applied"].sum().backward(retain_graph=True)
-        assert actions.grad.ravel().tolist() == [10.0, 10.0, 10.0, 0.0, 0.0]
-        actions.grad = None
-        infos["output"].sum().backward()
-        ours = actions.grad.ravel().tolist()
-        assert ours == pytest.approx([-0.4560, -0.4560, -0.4560, 0.0, 0.0])
+        for name, slope in (("applied", 10.0), ("output", -0.4560)):
+            (gradient,) = torch.autograd.grad(infos[name].sum(), actions, retain_graph=True)
+            assert gradient.ravel().tolist() == pytest.approx([slope] * 3 + [0.0, 0.0])
+
+    def test_a_policy_that_changes_nothing_can_learn_to(self):
+        env = make(1, differentiable=True, delay=0, **CHANGE)
+        env.reset()
+        actions = torch.zeros(1, 1, requires_grad=True)
+        env.step(actions)[-1]["output"].backward()
+        assert actions.grad.item() < 0.0
 
     def test_detach_cuts_what_was_before_and_nothing_else(self):
-        def gradients(cut):
-            shown = {"action_window": 3, "move_weight": 0.1, "noise_variance": 1.0}
-            env = make(2, differentiable=True, **shown)
+        totals, gradients = [], []
+        for cut in (False, True):
+            env = make(2, differentiable=True, noise_variance=1.0, **ALL_SHOWN)
             env.reset(seed=0)
-            actions = torch.full((60, 2, 1), 0.8, dtype=torch.float64)
-            actions[1::2] = 0.6
-            actions.requires_grad_()
+            actions = torch.tensor([0.8, 0.6] * 30, dtype=torch.float64, requires_grad=True)
             total = 0.0
             for k, a in enumerate(actions):
                 if k == 25 and cut:
                     env.detach()
-                observation, reward, _, _, infos = env.step(a)
+                observation, reward, _, _, infos = env.step(a.expand(2, 1))
                 if k >= 25:
                     total = total + reward.sum() + observation.sum() + infos["output"].sum()
-            total.backward()
-            return actions.grad, total.item()
-
-        (whole, value), (cut, same) = gradients(False), gradients(True)
-        assert value == same
-        assert whole[:25].abs().min() > 0
-        assert not cut[:25].any()
+            totals.append(total.item())
+            gradients += torch.autograd.grad(total, actions)
+        assert totals[0] == totals[1]
+        assert gradients[0][:25].abs().min() > 0
+        assert not gradients[1][:25].any()
         # The last move before the cut is one of an action after it, too.
-        torch.testing.assert_close(cut[25:], whole[25:])
+        torch.testing.assert_close(gradients[1][25:], gradients[0][25:])
 
     @pytest.mark.parametrize("differentiable", [False, True])
     def test_memory_does_not_grow_and_a_graph_is_kept_only_if_wanted(self, differentiable):
-        shown = {"action_window": 5, "output_window": 1, "move_weight": 0.1, **PRESETS["hard"]}
-        env = make(3, differentiable=differentiable, max_episode_steps=None, **shown)
+        plant = {**ALL_SHOWN, **HARD, **CHANGE, "max_episode_steps": None}
+        env = make(3, differentiable=differentiable, **plant)
         env.reset(seed=0)
         weight = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
         counts = []
@@ -220,122 +283,69 @@ class Waiting(TorchDispatchMode):
     """Refuses what a device would have to be waited for."""
 
     REFUSED = ("_local_scalar_dense", "nonzero", "is_nonzero", "masked_select", "equal")
-
-    def __init__(self):
-        super().__init__()
-        self.on_host = []  # tensors that would not be on the device
+    on_host = None  # a tensor that would not be on the device
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func._schema.name.partition("::")[2]
-        assert name not in self.REFUSED, name
+        assert name not in self.REFUSED
         indices = args[1] if name.startswith(("index", "_index")) else ()
-        for each in indices if isinstance(indices, list | tuple) else ():
-            assert each is None or each.dtype != torch.bool, f"{name} by a mask"
+        for index in indices if isinstance(indices, list | tuple) else ():
+            assert index is None or index.dtype != torch.bool, f"{name} by a mask"
         if name == "lift_fresh":
-            self.on_host.append(args[0])
-        elif any(each is other for each in args for other in self.on_host):
-            assert (name, args[2:]) == ("copy_", (True,)), f"{name} waits for a copy"
+            self.on_host = args[0]
+        elif any(argument is self.on_host for argument in args):
+            assert name == "_to_copy"
+            assert kwargs["non_blocking"], "waits for a copy"
         return func(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("differentiable", [False, True])
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_a_step_never_waits_for_the_device(mode, differentiable):
-    shell = {"max_episode_steps": 12, "autoreset_mode": mode, "differentiable": differentiable}
-    most = {**PRESETS["hard"], "action_window": 5, "move_weight": 0.1}
-    for plant in (most, {}):
-        env = make(3, **shell, **plant)
-        env.checks_actions = False  # as on any device but the CPU
-        env.reset(seed=0)
-        env.step(torch.zeros(3, 1, dtype=torch.float64))
-        env.reset(options={"reset_mask": torch.tensor([True, False, False])})
-        with Waiting():
-            for _ in range(27):
-                env.step(torch.zeros(3, 1, dtype=torch.float64))
-
-
-@pytest.mark.parametrize(("given", "named"), [
-    *(({name: value}, f"^{name} must be") for name, value in [
-        ("dtype", torch.float16), ("dtype", "float32"), ("dtype", np.ones(2)),
-        ("device", "toaster"), ("device", "meta"), ("differentiable", "yes"),
-    ]),
-    ({"seed": 1 << 63}, "^seed must be None or an integer"),
-    *(({"options": {"signals": signals}}, named) for signals, named in [
-        ({}, "signals"), ({"nois": torch.zeros(5, 2)}, "signals"), (3, "signals"),
-        ({"disturbance": torch.zeros(5, 2)}, "disturbance"),
-        ({"delay": torch.zeros(2)}, "delay"), ({"delay": torch.full((2,), 7.5)}, "delay"),
-        ({"dead_zone": torch.zeros(2)}, "dead_zone"),
-    ]),
-    *(({"options": {"signals": {"noise": values}}}, "noise") for values in [
-        torch.zeros(5, 3), torch.zeros(2), torch.full((5, 2), torch.nan), "x", None, [[1], []],
-    ]),
+@pytest.mark.parametrize("arguments", [
+    {}, {"autoreset_mode": "SameStep", "differentiable": True, **HARD, **ALL_SHOWN},
+    {**HARD, **CHANGE},
 ])  # fmt: skip
-def test_what_is_refused_is_named(given, named):
-    if given.keys() & {"seed", "options"}:
-        env = make(delay=[5, 9])
-        env.reset(seed=(1 << 63) - 1)  # the largest
-        assert env.np_random_seed == (1 << 63) - 1
-        with pytest.raises(ValueError, match=named):
-            env.reset(**given)
-    else:
-        with pytest.raises(ValueError, match=named):
-            MiddlePointTorchEnv(2, **given)
+def test_a_step_never_waits_for_the_device(arguments):
+    env = make(3, max_episode_steps=12, **arguments)
+    env.checks_actions = False  # as on any device but the CPU
+    env.reset(seed=0)
+    env.step(torch.zeros(3, 1, dtype=torch.float64))
+    env.reset(options={"reset_mask": torch.tensor([True, False, False])})
+    with Waiting():
+        for _ in range(27):
+            env.step(torch.zeros(3, 1, dtype=torch.float64))
 
 
-def test_signals_end_with_an_error_and_with_a_reset_without():
-    env = make(noise_variance=0.5)
-    env.reset(seed=0, options={"signals": {"noise": torch.ones(4, 2)}})
-    some = {"reset_mask": torch.tensor([True, False]), "signals": {"noise": 1.0}}
-    with pytest.raises(ValueError, match="signals"):
-        env.reset(options=some)
-    for _ in range(3):
-        assert env.step(torch.zeros(2, 1))[-1]["noise"].tolist() == [1.0, 1.0]
-    with pytest.raises(ValueError, match="end at sample 3"):
-        env.step(torch.zeros(2, 1))
-    env.reset()
-    assert env.step(torch.zeros(2, 1))[-1]["noise"].tolist() != [1.0, 1.0]
+def test_types_and_seeds_beyond_those_of_pytorch_are_named():
+    with pytest.raises(ValueError, match=r"^dtype must be"):
+        MiddlePointTorchEnv(2, dtype=torch.float16)
+    env = make()
+    env.reset(seed=(1 << 63) - 1)  # the largest
+    assert env.np_random_seed == (1 << 63) - 1
+    with pytest.raises(ValueError, match=r"^seed must be None or an integer"):
+        env.reset(seed=1 << 63)
 
 
-def test_after_the_last_given_episode_the_first_follows_again():
-    env = make(1, max_episode_steps=2)
-    levels = torch.tensor([1.0, 2.0])[:, None, None].expand(2, 3, 1)  # episodes, samples, n
-    setpoints = [env.reset(options={"signals": {"setpoint": levels}})[1]["setpoint"].item()]
-    setpoints += [env.step(torch.zeros(1, 1))[-1]["setpoint"].item() for _ in range(11)]
-    assert setpoints == [1.0] * 3 + [2.0] * 3 + [1.0] * 3 + [2.0] * 3
-
-
-class TestById:
-    def test_it_is_that_of_the_id(self):
-        env = make_vec(
-            "MiddlePointHard-v0", 3, dtype=torch.float64, delay=[2, 4], max_episode_steps=9
-        )
-        single = gymnasium.make(env.spec)
-        assert env.parameters == single.unwrapped.parameters
-        assert env.spec.id == "MiddlePointHard-v0"
-        assert env.spec.max_episode_steps == 9
-        assert env.dtype is torch.float64
-        env.reset(seed=0)
-        ended = [env.step(torch.zeros(3, 1))[3].all().item() for _ in range(9)]
-        assert ended == [False] * 8 + [True]
-
-    @pytest.mark.parametrize(
-        ("env", "named"),
-        [
-            ("MiddlePointHart-v0", "Did you mean: .MiddlePointHard"),
-            ("CartPole-v1", "spec of a MiddlePointEnv, without wrappers"),
-            (IncrementalAction(gymnasium.make("MiddlePoint-v0")).spec, "without wrappers"),
-        ],
+def test_by_id_it_is_that_of_the_id():
+    env = make_vec(
+        "MiddlePointHard-v0", 3, dtype=torch.float64, delay=[2, 4], max_episode_steps=9
     )
-    def test_others_are_refused(self, env, named):
-        with pytest.raises(ValueError, match=named):
-            make_vec(env, 2)
+    assert env.parameters == gymnasium.make(env.spec).unwrapped.parameters
+    assert env.spec.id == "MiddlePointHard-v0"
+    assert env.spec.max_episode_steps == 9
+    assert env.dtype is torch.float64
+    env.reset(seed=0)
+    ended = [env.step(torch.zeros(3, 1))[3].all().item() for _ in range(9)]
+    assert ended == [False] * 8 + [True]
+    drawn = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array", dead_zone=[1, 2])
+    assert make_vec(drawn.spec, 2).parameters == drawn.unwrapped.parameters
+    with pytest.raises(ValueError, match="spec of a MiddlePointEnv, without wrappers"):
+        make_vec("CartPole-v1", 2)
 
 
-@pytest.mark.parametrize("differentiable", [False, True])
+@pytest.mark.parametrize("form", [{}, CHANGE])
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
-def test_a_copy_in_mid_episode_goes_on_alike(duplicate, differentiable):
-    shown = {"action_window": 4, "move_weight": 0.1, "max_episode_steps": 50}
-    env = make(3, differentiable=differentiable, **shown, **PRESETS["hard"])
+def test_a_copy_in_mid_episode_goes_on_alike(duplicate, form):
+    plant = {**ALL_SHOWN, "max_episode_steps": 50, **HARD, **form}
+    env = make(3, differentiable=True, **plant)
     env.reset(seed=0)
     weight = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
     for _ in range(27):
@@ -343,13 +353,24 @@ def test_a_copy_in_mid_episode_goes_on_alike(duplicate, differentiable):
     other = duplicate(env)
     for k in range(60):  # beyond the end of the episode
         action = torch.full((3, 1), (-1) ** k * 0.8, dtype=torch.float64)
-        *arrays, infos = env.step(action)
-        *other_arrays, other_infos = other.step(action)
-        for array, expected in zip(other_arrays, arrays, strict=True):
-            assert torch.equal(array, expected)
-            assert not array.requires_grad
-        assert torch.equal(other_infos["noise"], infos["noise"])
+        for returned, expected in zip(
+            other.step(action)[:4], env.step(action)[:4], strict=True
+        ):
+            assert torch.equal(returned, expected)
+            assert not returned.requires_grad
 
 
-def arrays(values):
-    return {name: torch.as_tensor(each).numpy() for name, each in values.items()}
+@pytest.mark.parametrize("form", [{}, CHANGE])
+def test_after_steps_in_the_inference_mode_there_are_gradients(form):
+    with torch.inference_mode():
+        env = make(2, differentiable=True, max_episode_steps=40, **ALL_SHOWN, **HARD, **form)
+        env.reset(seed=0)
+        for _ in range(35):
+            env.step(torch.full((2, 1), 0.5, dtype=torch.float64))
+    actions = torch.full((45, 2, 1), 0.7, dtype=torch.float64, requires_grad=True)
+    for a in actions:  # into the next episode
+        observations, rewards, *_, infos = env.step(a)
+        for returned in (observations, rewards, *infos.values()):
+            assert not returned.is_inference()
+    rewards.sum().backward()
+    assert actions.grad.any()

@@ -19,8 +19,8 @@ Four choices make the training of PPO fast:
 - **Less and less exploration.** The standard deviation of the actions falls by a schedule,
   because a standard deviation that PPO learns remains too high.
 
-- **Changes of the flow as actions.** The wrapper `IncrementalAction` makes the action a change
-  of the flow, and compensates the dead zone of the valve.
+- **Changes of the flow as actions.** With `action="change"`, an action is a change of the flow,
+  and the commands skip the dead zone of the valve.
 """
 
 import argparse
@@ -53,7 +53,9 @@ SETTINGS: dict[str, Any] = {
 # Arguments of the environment that determine the observation.
 WINDOWS = {"setpoint_window": 3, "error_window": 1, "output_window": 64, "action_window": 64}
 PLANTS: dict[str, Any] = {
-    "wrapper": {"max_move": 2.0, "compensate_dead_zone": True},
+    "action": "change",
+    "max_move": 2.0,
+    "compensated_dead_zone": 5.0,
     "noise_variance": [0.0, 0.5],
     "setpoint": "random",
     "setpoint_amplitude": 6.0,

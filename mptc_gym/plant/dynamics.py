@@ -128,32 +128,39 @@ class WantedFlows:
         self._u_min = parameters.lowest.u_min
         self._u_max = parameters.lowest.u_max
         self._flow_per_action = parameters.max_move * ((self._u_max - self._u_min) / 2.0)
-        self._dead_zone = parameters.compensated_dead_zone
+        self._dead_zone: Any = parameters.compensated_dead_zone
         self._slope_above = self._slope(self._u_max)
         self._slope_below = self._slope(-self._u_min)
-        self._flows = np.zeros(n)  # v, t/h
+        self._flows: Any = np.zeros(n)  # v, t/h
 
     def _slope(self, limit: float) -> float:
         """Return du/dv for flows towards a limit whose magnitude is `limit`, t/h."""
         if limit <= 0.0:  # no wanted flow has this direction
             return 0.0
-        return max(limit - self._dead_zone, 0.0) / limit
+        return float(max(limit - self._dead_zone, 0.0) / limit)
 
     def reset(self, plants: NDArray[np.intp]) -> None:
         """Set the wanted flows of the plants with the indices `plants` to 0 t/h."""
         self._flows[plants] = 0.0
 
-    def change(self, actions: Values) -> Values:
+    def change(self, actions: Any) -> Any:
         """Change the wanted flows, and return the actions that set them, shape (n,).
 
-        `actions` are finite and are clipped to +-1. The returned actions are rounded to
-        float32, as the actions of a policy are.
+        `actions` are finite and are clipped to +-1: an array, or a tensor in a subclass. The
+        returned actions are rounded to float32, as the actions of a policy are.
         """
-        flows = self._flows + self._flow_per_action * np.clip(actions, -1.0, 1.0)
-        self._flows = np.clip(flows, self._u_min, self._u_max)
-        above = (self._flows > 0.0) * (self._dead_zone + self._slope_above * self._flows)
-        below = (self._flows < 0.0) * (self._dead_zone - self._slope_below * self._flows)
-        rounded = float32_action(above - below, self._u_min, self._u_max, self._dead_zone)
+        flows = self._flows + self._flow_per_action * actions.clip(-1.0, 1.0)
+        self._flows = flows.clip(self._u_min, self._u_max)
+        is_above = self._flows > 0.0
+        is_below = self._flows < 0.0
+        edges = is_above * self._dead_zone - is_below * self._dead_zone
+        above = is_above * (self._slope_above * self._flows)
+        below = ~is_above * (self._slope_below * self._flows)
+        return self._rounded_actions(edges + above + below)
+
+    def _rounded_actions(self, commands: Any) -> Any:
+        """Return the actions that command flows, t/h, rounded to float32."""
+        rounded = float32_action(commands, self._u_min, self._u_max, self._dead_zone)
         return rounded.astype(np.float64)
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn, cast
 
 import gymnasium
@@ -13,10 +12,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
-
-from mptc_gym.environments.making import make_batch
-from mptc_gym.plant.checks import count, reject
-from mptc_gym.wrappers import IncrementalAction
 
 
 class GymnasiumVecEnv(VecEnv):
@@ -33,9 +28,6 @@ class GymnasiumVecEnv(VecEnv):
     *batches
         Vector environments of Gymnasium with autoreset mode "SameStep" and with equal spaces.
         The environments of all batches are numbered in the order of the batches.
-    spec
-        `EnvSpec` of one of the environments, with the wrappers; None if the environments
-        differ.
     group
         Number of successive environments that share a seed, and thus all random numbers.
 
@@ -45,14 +37,11 @@ class GymnasiumVecEnv(VecEnv):
         Infos of the latest `reset` or `step`: a dict from names to arrays of shape (num_envs,).
     """
 
-    def __init__(
-        self, *batches: VectorEnv[Any, Any, Any], spec: EnvSpec | None = None, group: int = 1
-    ) -> None:
+    def __init__(self, *batches: VectorEnv[Any, Any, Any], group: int = 1) -> None:
         modes = {batch.metadata.get("autoreset_mode") for batch in batches}
         if modes != {AutoresetMode.SAME_STEP}:
             raise ValueError(f"batches must have autoreset_mode 'SameStep', got {modes}")
         self.batches: tuple[Any, ...] = batches
-        self.spec = spec
         self.group = group
         self.infos: dict[str, Any] = {}
         self._slices: list[slice] = []  # indices of the environments of each batch
@@ -167,14 +156,11 @@ class GymnasiumVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return the value of an attribute for each environment in `indices`.
 
-        The attribute "spec" is the spec of a single environment; any other attribute is taken
-        from the vector environment that holds the environment.
+        The attribute is taken from the vector environment that holds the environment.
         """
         values: list[Any] = []
         for batch in self.batches:
-            value = self.spec
-            if attr_name != "spec":
-                value = getattr(batch.unwrapped, attr_name)
+            value = getattr(batch.unwrapped, attr_name)
             values += [value] * batch.num_envs
         return [values[index] for index in self._get_indices(indices)]
 
@@ -230,7 +216,6 @@ def make_vec_env(
     *,
     seed: int | None = None,
     group: int = 1,
-    wrapper: Mapping[str, Any] | Callable[..., Any] | None = None,
     **arguments: Any,
 ) -> GymnasiumVecEnv:
     """Return `n_envs` plants, stepped at once, as a `VecEnv` of Stable-Baselines3.
@@ -238,7 +223,8 @@ def make_vec_env(
     Parameters
     ----------
     env
-        Id or `EnvSpec` of the environment.
+        Id or `EnvSpec` of the environment, without wrappers. For wrapped environments, use
+        `stable_baselines3.common.env_util.make_vec_env`.
     n_envs
         Number of plants, each of which is one environment.
     seed
@@ -250,40 +236,16 @@ def make_vec_env(
         Number of successive plants that share a seed. Plants with the same seed have the same
         parameter values, noise, load and set points, and differ only in the random part of the
         policy's actions.
-    wrapper
-        Arguments of an `IncrementalAction` that wraps the plants, or the class
-        `IncrementalAction` for default arguments, or None for no wrapper. For any other
-        wrapper, use `stable_baselines3.common.env_util.make_vec_env`.
     **arguments
-        Further arguments of the plants, as in `gymnasium.make`. The argument `render_mode` may
-        be "rgb_array".
+        Further arguments of the plants, as in `gymnasium.make_vec`. The argument `render_mode`
+        may be "rgb_array".
 
     Raises
     ------
     ValueError
-        If `env` is not an environment of this package, or has wrappers other than
-        `IncrementalAction`. If an argument is out of range.
+        If an argument is out of range.
     """
-    n_envs = count("n_envs", n_envs, 1)
-    group = count("group", group, 1, n_envs)
-    if seed is not None:
-        seed = count("seed", seed, 0, 2**63 - 1)
-    render_mode = arguments.pop("render_mode", None)  # for the batch, but not for its spec
-    single = gymnasium.make(env, disable_env_checker=True, **arguments)
-    if isinstance(wrapper, Mapping):
-        unknown = set(wrapper) - set(inspect.signature(IncrementalAction).parameters)
-        if unknown:
-            reject("wrapper", wrapper, "arguments of IncrementalAction")
-        single = IncrementalAction(single, **wrapper)
-    elif callable(wrapper):
-        single = wrapper(single)
-    elif wrapper is not None:
-        reject("wrapper", wrapper, "IncrementalAction, or a dict of its arguments")
-    batch = make_batch(
-        single, n_envs, autoreset_mode=AutoresetMode.SAME_STEP, render_mode=render_mode
-    )
-    if batch is None:
-        reject("env", single, "of this package, in no wrapper other than IncrementalAction")
-    plants = GymnasiumVecEnv(batch, spec=single.spec, group=group)
+    batch = gymnasium.make_vec(env, n_envs, autoreset_mode="SameStep", **arguments)
+    plants = GymnasiumVecEnv(batch, group=group)
     plants.seed(seed)
     return plants

@@ -1,0 +1,141 @@
+"""Fit a plant to the log of a bump test, for the option `--plant` of the benchmarks.
+
+    python benchmarks/examples/fit_plant.py log.csv --dead-zone 5 --u-min -10 --u-max 10
+    python -m benchmarks.compare --plant plant.json --agents pi-simc smith dahlin
+
+In a bump test, an operator moves the flow by hand a few times, and waits after each move until
+the temperature has nearly settled. The log is a CSV file with three columns:
+
+- `time`: the time of the row, s, with the same interval between all rows;
+- `flow`: the flow that is commanded from the time of the row on, t/h, as a deviation from the
+  middle of the dead zone;
+- `temperature`: the temperature at the time of the row, degC.
+
+The model is equation (28) of the paper with one lag, whose pole is p, and with a delay of d
+samples. The applied flow u_a is 0 inside the dead zone, and otherwise the commanded flow within
+the limits, as in equation (29)::
+
+    y(k) = p y(k-1) + gain (1 - p) u_a(k-1-d),  p = exp(-sampling interval / time constant)
+    temperature(k) = offset + y(k)
+"""
+
+import json
+from pathlib import Path
+
+import cyclopts
+import numpy as np
+import pandas as pd
+from cyclopts.types import ExistingFile
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+Array = NDArray[np.float64]
+# The longest delay that a fit tries, samples. If the delay of a plant has more samples, the log
+# has more rows than a fit needs: keep every tenth row.
+LONGEST_DELAY = 200
+
+
+def read_log(file: Path) -> pd.DataFrame:
+    """Return a log, or exit with a message if columns are missing or times not equidistant."""
+    try:
+        log = pd.read_csv(file, usecols=["time", "flow", "temperature"], dtype=float).dropna()
+    except ValueError as error:
+        raise SystemExit(
+            f"{file} must have the columns time, flow and temperature: {error}"
+        ) from error
+    times = log.time.to_numpy()
+    intervals = np.diff(times)
+    usual = np.median(intervals)
+    row = int(np.argmax(np.abs(intervals - usual)))
+    if abs(intervals[row] - usual) > 0.1 * usual:
+        raise SystemExit(
+            f"{file}: times must be equidistant, but {times[row + 1]:g} s comes "
+            f"{intervals[row]:g} s after the time before, and most times {usual:g} s"
+        )
+    return log
+
+
+def regress(applied: Array, temperature: Array, delay: int, pole: float) -> tuple[Array, Array]:
+    """Fit gain and offset to a log, for a given delay in samples and a given pole p.
+
+    Before the first row of the log, the plant was at rest with any constant flow.
+
+    Returns
+    -------
+    factors : array of shape (3,)
+        Gain, degC per t/h; temperature at rest with a flow of 0 minus the temperature at rest
+        before the first row, degC; and the temperature at rest before the first row, degC.
+    errors : array of shape (rows,)
+        Temperatures of the model minus those of the log, degC.
+    """
+    # The applied flow, and a step at the first row, which ends the flow before the first row.
+    inputs = np.pad([applied, np.ones_like(applied)], ((0, 0), (delay + 1, 0)))
+    responses = lfilter([1.0 - pole], [1.0, -pole], inputs[:, : len(applied)])
+    signals = np.stack([*responses, np.ones_like(applied)], axis=1)
+    factors = np.linalg.lstsq(signals, temperature, rcond=None)[0]
+    return factors, signals @ factors - temperature
+
+
+def fit_lag(applied: Array, temperature: Array) -> tuple[int, float]:
+    """Return delay in samples and pole p that give the smallest sum of squared errors."""
+
+    def errors(log_time_constant: Array, delay: int) -> Array:
+        pole = np.exp(-1.0 / np.exp(log_time_constant[0]))
+        return regress(applied, temperature, delay, pole)[1]
+
+    delays = range(min(LONGEST_DELAY + 1, len(applied) // 2))
+    # The search begins with a time constant of 20 samples.
+    fits = [least_squares(errors, np.log([20.0]), args=(delay,)) for delay in delays]
+    best = int(np.argmin([fit.cost for fit in fits]))
+    return best, float(np.exp(-1.0 / np.exp(fits[best].x[0])))
+
+
+def main(log_file: ExistingFile, *, dead_zone: float, u_min: float, u_max: float) -> None:
+    """Fit a plant to the log of a bump test, and write `plant.json` and `plant.png`.
+
+    Parameters
+    ----------
+    log_file
+        CSV file with the columns time (s), flow (t/h) and temperature (degC).
+    dead_zone
+        Half width of the valve's dead zone, t/h; 0 if there is none.
+    u_min, u_max
+        Limits of the flow, t/h.
+    """
+    log = read_log(log_file)
+    applied = np.where(np.abs(log.flow) < dead_zone, 0.0, np.clip(log.flow, u_min, u_max))
+    if np.ptp(applied) == 0.0:
+        raise SystemExit(
+            f"{log_file}: the flow must move outside of the dead zone and within the limits"
+        )
+    temperature = log.temperature.to_numpy()
+    delay, pole = fit_lag(applied, temperature)
+    (gain, change, level), errors = regress(applied, temperature, delay, pole)
+    interval = float(np.diff(log.time).mean())
+    plant = {
+        "a": [1.0, -pole],
+        "b": [gain * (1.0 - pole)],
+        "c": [1.0],
+        "delay": delay,
+        "dead_zone": dead_zone,
+        "u_min": u_min,
+        "u_max": u_max,
+        "sampling_interval": interval,
+    }
+    Path("plant.json").write_text(json.dumps(plant, indent=1))
+    log["fit"] = temperature + errors
+    panels = log.plot(
+        x="time", subplots=[("temperature", "fit"), ("flow",)], drawstyle="steps-post"
+    )
+    panels[0].set_ylabel("temperature (degC)")
+    panels[1].set(xlabel="time (s)", ylabel="flow (t/h)")
+    panels[0].figure.savefig("plant.png")
+    print(
+        f"gain {gain:.4g} degC per t/h, time constant {-interval / np.log(pole):.4g} s, delay "
+        f"{delay} samples of {interval:g} s, temperature at flow 0 {level + change:.4g} degC"
+    )
+
+
+if __name__ == "__main__":
+    cyclopts.run(main)
