@@ -12,7 +12,7 @@ from stable_baselines3 import PPO
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import CommandError
-from benchmarks.loop.rollout import make_plants, mean_error, rollout
+from benchmarks.loop.measures import make_plants, mean_error, rollout
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from tests.conftest import ROOT
@@ -178,17 +178,20 @@ class TestOwnControllers:
     def test_a_zip_of_stable_baselines3_enters_by_the_lines_of_the_page(
         self, written, tmp_path, monkeypatch
     ):
-        windows = {"error_window": 8, "action_window": 30}
-        env = gymnasium.make("MiddlePoint-v0", **windows)
+        interface = {
+            "action": "change", "max_move": 2.0, "error_window": 8, "action_window": 30
+        }  # fmt: skip
+        env = gymnasium.make("MiddlePoint-v0", **interface)
         model = PPO("MlpPolicy", env, seed=0, device="cpu")
-        model.save(tmp_path / "model.zip")
+        (tmp_path / "best").mkdir()
+        model.save(tmp_path / "best/best_model.zip")
         page = (ROOT / "benchmarks/examples/train_your_own.md").read_text(encoding="utf-8")
         (code,) = re.findall(
             r"```python\n(from stable_baselines3 import PPO\n\n\ndef.*?)```", page, re.DOTALL
         )
         monkeypatch.chdir(tmp_path)
         (member,) = members_of(written(code.replace("def ppo", "def Mine")))
-        expected = evaluate(model, IDS["noisy"], episodes=3, **windows)
+        expected = evaluate(model, IDS["noisy"], episodes=3, **interface)
         np.testing.assert_allclose(
             errors(member, 3, 1200, **PRESETS["noisy"]), expected.errors, rtol=0, atol=1e-9
         )
