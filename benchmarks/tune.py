@@ -18,7 +18,7 @@ from benchmarks.lib.command import CommandError, Count, Folder, Parameter, comma
 from benchmarks.lib.fan_out import with_progress_bar
 from benchmarks.lib.outputs import new_folder, provenance_of, write_csv, write_json
 from benchmarks.lib.seeds import SEEDS
-from benchmarks.loop.rollout import mean_error, settled
+from benchmarks.loop.measures import mean_error, settled
 from benchmarks.loop.scenarios import Arguments, PlantOptions
 from mptc_gym import PRESETS, Parameters
 

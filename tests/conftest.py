@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from benchmarks.loop.rollout import Trajectory
+from benchmarks.loop.measures import Trajectory
 from mptc_gym import MiddlePointVectorEnv
 from mptc_gym.plant import checks
 from mptc_gym.plant.parameters import ARGUMENTS, CAN_BE_RANGES

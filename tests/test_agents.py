@@ -22,7 +22,7 @@ from agents import (
     Weights,
 )
 from agents.networks import PRETRAINED
-from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.measures import make_plants, rollout
 from mptc_gym import Parameters
 from tests.conftest import STEP_TEST, assert_the_seed_is_all_that_differs
 

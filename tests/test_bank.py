@@ -14,7 +14,7 @@ from agents.bank import (
 )
 from agents.hedge import RandomSetpoint
 from agents.output_filter import LOAD_MEMORY, READING_SHARE, OutputFilter
-from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.measures import make_plants, rollout
 from tests.conftest import STEP_TEST
 
 KNOWN = {**STEP_TEST, "dead_zone": 5.0}

@@ -20,7 +20,7 @@ from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib.command import CommandError
 from benchmarks.lib.fan_out import Finished
 from benchmarks.loop.linear import LinearModel
-from benchmarks.loop.rollout import make_plants, mean_error, rollout
+from benchmarks.loop.measures import make_plants, mean_error, rollout
 from benchmarks.loop.scenarios import SCENARIOS, Scenario
 from mptc_gym import Parameters
 from mptc_gym.plant.dynamics import action_from_command

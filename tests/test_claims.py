@@ -12,7 +12,7 @@ from benchmarks.claims.claims import CLAIMS, Claim, examined
 from benchmarks.claims.findings import judge, sections, table, verdict
 from benchmarks.claims.runs import Batch, converged_at
 from benchmarks.lib.statistics import Estimate
-from benchmarks.loop.rollout import settled
+from benchmarks.loop.measures import settled
 from tests.conftest import ROOT, trajectory
 
 GOOD, INFORMATION = {"at_least": 1.0}, {}

@@ -23,7 +23,7 @@ from benchmarks.compare.estimates import estimate, ranked
 from benchmarks.compare.runs import least_error, run_case
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.loop.rollout import make_plants, measure, rollout
+from benchmarks.loop.measures import make_plants, measure, rollout
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED

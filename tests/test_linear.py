@@ -7,7 +7,7 @@ from scipy import signal
 from agents import DahlinController, PIController, SmithPredictor
 from benchmarks.lib.command import CommandError
 from benchmarks.loop.linear import LinearLoop, nominal, step_test, time_constant_for
-from benchmarks.loop.rollout import make_plants, rollout
+from benchmarks.loop.measures import make_plants, rollout
 from benchmarks.loop.scenarios import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters
 from tests.conftest import STEP_TEST, run
@@ -130,25 +130,25 @@ class TestLoop:
     def test_sensitivity_and_delays_by_hand(self):
         # y(k+1) = y(k) + u(k - d), u = Kp e: stable for Kp < 2 sin(pi / (4 d + 2)), which is
         # 2, 1, 0.618, 0.445, ... for d = 0, 1, 2, 3. For d = 0, |S| is largest at z = -1.
+        for kp, longest in ((0.61, 2), (0.63, 1), (0.99, 1), (1.01, 0), (2.01, -1)):
+            for delay in (longest, longest + 1):
+                if delay >= 0:
+                    integrator = nominal(Parameters(a=[1.0, -1.0], b=[1.0], delay=delay))
+                    loop = LinearLoop.of(Proportional(kp), integrator)
+                    assert loop.is_stable() == (delay <= longest)
         integrator = nominal(Parameters(a=[1.0, -1.0], b=[1.0], delay=0))
-        for kp, longest in ((0.61, 2), (0.63, 1), (0.99, 1), (1.01, 0)):
-            loop = LinearLoop.of(Proportional(kp), integrator)
-            assert loop.stable_delays() == (0, longest)
-            assert loop.sensitivity() == pytest.approx(2.0 / (2.0 - kp))
-        unstable = LinearLoop.of(Proportional(2.01), integrator)
-        assert unstable.stable_delays() is None
-        assert unstable.sensitivity() == np.inf
+        loop = LinearLoop.of(Proportional(0.61), integrator)
+        assert loop.sensitivity() == pytest.approx(2.0 / (2.0 - 0.61))
+        assert LinearLoop.of(Proportional(2.01), integrator).sensitivity() == np.inf
 
-    def test_the_range_of_delays_is_that_of_loops_that_settle(self):
+    @pytest.mark.parametrize("delay", [14, 15, 21, 22])
+    def test_a_loop_is_stable_if_its_output_settles(self, delay):
         controller = SmithPredictor(**STEP_TEST, closed_loop_time_constant=25.0)
-        loop = LinearLoop.of(controller, nominal(Parameters()))
-        shortest, longest = loop.stable_delays()
-        assert 0 < shortest < 18 < longest < 30
-        for delay in (shortest - 1, shortest, longest, longest + 1):
-            plants = make_plants(1, 1500, setpoint=[1e-3, 0.0], delay=delay, dead_zone=0.0)
-            output = rollout(plants, controller, 1500, seed=0).output
-            growth = np.ptp(output[-300:]) / np.ptp(output[300:600])
-            assert (growth < 1.0) == (shortest <= delay <= longest)
+        loop = LinearLoop.of(controller, nominal(Parameters(delay=delay)))
+        plants = make_plants(1, 1500, setpoint=[1e-3, 0.0], delay=delay, dead_zone=0.0)
+        output = rollout(plants, controller, 1500, seed=0).output
+        growth = np.ptp(output[-300:]) / np.ptp(output[300:600])
+        assert loop.is_stable() == (growth < 1.0)
 
     def test_a_rule_is_slowed_down_until_its_sensitivity_is_the_target(self):
         plant = nominal(Parameters())

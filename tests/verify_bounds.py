@@ -11,7 +11,7 @@ from benchmarks.bounds.least import least_possible
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.report import on_screen
 from benchmarks.lib.statistics import student
-from benchmarks.loop.rollout import mean_error
+from benchmarks.loop.measures import mean_error
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import SEED

@@ -123,7 +123,7 @@ def row(case: Scenario, mpc_runs: int | None) -> dict[str, str]:
     from benchmarks.bounds.linear_program import NoBoundError
     from benchmarks.controllers.roster import ROSTER
     from benchmarks.lib.statistics import bootstrap
-    from benchmarks.loop.rollout import mean_error
+    from benchmarks.loop.measures import mean_error
 
     least = partial(least_possible, samples=case.samples, **case.arguments)
     # Formatting an `Estimate`, as in f"{estimate:.4f}", adds the interval in parentheses.

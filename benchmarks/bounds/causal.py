@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from benchmarks.bounds.linear_program import ErrorBounds, equations, response
 from benchmarks.loop.linear import LinearModel
-from benchmarks.loop.rollout import held
+from benchmarks.loop.measures import held
 from mptc_gym.plant.signals import SetPointLevels
 
 Array = NDArray[np.float64]

@@ -31,7 +31,7 @@ from benchmarks.bounds.linear_program import (
 from benchmarks.bounds.unknown import error_bounds
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.loop.linear import LinearModel
-from benchmarks.loop.rollout import (
+from benchmarks.loop.measures import (
     IdleValve,
     drawn_numbers,
     is_random,

@@ -8,7 +8,7 @@ import scipy  # loads its modules on first use
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.loop.linear import LinearModel
-from benchmarks.loop.rollout import held
+from benchmarks.loop.measures import held
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from agents import DirectNNController, PIController
 from benchmarks.claims.findings import MOST_RUNS, Finding, judge, judge_share, judge_times
 from benchmarks.claims.runs import PAPER_LENGTH, Batch, WeightLog, converged_at
 from benchmarks.loop import linear
-from benchmarks.loop.rollout import mean_error, settled
+from benchmarks.loop.measures import mean_error, settled
 from benchmarks.loop.scenarios import SETPOINTS as PAPER_SETPOINTS
 from benchmarks.loop.scenarios import Arguments, Scenario
 from mptc_gym import PRESETS, Parameters

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents import DirectNNController, PIController
-from benchmarks.loop.rollout import Agent, Trajectory, make_plants, rollout
+from benchmarks.loop.measures import Agent, Trajectory, make_plants, rollout
 
 Array = NDArray[np.floating]
 

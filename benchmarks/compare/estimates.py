@@ -14,7 +14,7 @@ from benchmarks.compare.runs import Bound
 from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.outputs import write_csv
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles
-from benchmarks.loop.rollout import is_random
+from benchmarks.loop.measures import is_random
 
 BOOTSTRAP_SEED = 0  # seed of the resampling for confidence intervals, not of an episode
 

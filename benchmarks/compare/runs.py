@@ -16,7 +16,7 @@ from benchmarks.bounds.least import LeastPossible, least_possible
 from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.statistics import percentiles
 from benchmarks.loop.linear import LinearController, LinearLoop, nominal
-from benchmarks.loop.rollout import Trajectory, is_random, make_plants, measure, rollout
+from benchmarks.loop.measures import Trajectory, is_random, make_plants, measure, rollout
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
 
@@ -39,7 +39,7 @@ class Result:
     runs : sequence of dict
         A table for each member with a row for each run, and the columns `scenario`, `agent`,
         `policy` (the number of the member), `seed`, and the measures that
-        `benchmarks.loop.rollout.measure` returns.
+        `benchmarks.loop.measures.measure` returns.
     responses : dict
         Table of temperature and flow with a row for each sample, from `responses_over_time`.
     sensitivity : float, optional

@@ -25,7 +25,7 @@ from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.controllers.spans import Spans, dahlin_spans, nn_spans, pi_spans
 from benchmarks.lib.seeds import SEEDS
-from benchmarks.loop.rollout import Agent, IdleValve, Trajectory, make_plants, rollout
+from benchmarks.loop.measures import Agent, IdleValve, Trajectory, make_plants, rollout
 from mptc_gym import Parameters
 
 # Ratio of the closed-loop time constant of Dahlin's controller to the plant's time constant.

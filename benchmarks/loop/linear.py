@@ -38,7 +38,6 @@ REMAINING_TRANSIENT = 1e-5  # share of a transient that remains after a step tes
 # frequency of a sampled signal.
 FREQUENCIES = np.geomspace(1e-4, math.pi, 400)
 CIRCLE_POINTS = 1 << 14  # points on the unit circle for the count of unstable poles
-LONGEST_DELAY = 1000  # samples; `stable_delays` examines no longer delay
 TIME_CONSTANTS_TRIED = 24  # number of time constants before the bisection
 PRECISION = 1e-5  # relative precision of the time constant that `time_constant_for` returns
 
@@ -318,48 +317,44 @@ class LinearLoop:
     Attributes
     ----------
     numerator, denominator : Array
-        Transfer function from the error e (degC) to the temperature y (degC), without the delay
-        of the plant: coefficients of z^0, z^-1 and so on.
-    delay : int
-        Delay d of the plant, equation (28) of the paper, samples.
+        Transfer function from the error e (degC) to the temperature y (degC), with the delay of
+        the plant: coefficients of z^0, z^-1 and so on.
     """
 
     numerator: Array
     denominator: Array
-    delay: int
 
     @classmethod
     def of(cls, controller: LinearController, plant: LinearModel) -> "LinearLoop":
         """Return the closed loop of `controller` and `plant`, which must be a single plant."""
         controller_numerator, controller_denominator = controller.transfer()
         # The coefficients of B begin at z^-1, since a flow affects the next output at the
-        # earliest.
-        numerator = np.convolve(controller_numerator, np.append(0.0, plant.beta))
+        # earliest, and the delay of the plant adds further zeros.
+        zeros = np.zeros(round(plant.numbers.delay) + 1)
+        numerator = np.convolve(controller_numerator, np.append(zeros, plant.beta))
         denominator = np.convolve(controller_denominator, np.append(1.0, -plant.alpha))
-        return cls(numerator, denominator, round(plant.numbers.delay))
+        return cls(numerator, denominator)
 
-    def characteristic(self, delay: int) -> Array:
-        """Return the loop's characteristic polynomial for a plant delay of `delay` samples.
+    @property
+    def characteristic(self) -> Array:
+        """Coefficients of z^0, z^-1, z^-2 and so on of the loop's characteristic polynomial.
 
-        The returned array has the coefficients of z^0, z^-1, z^-2 and so on. The zeros of the
-        characteristic polynomial in z are the poles of the loop.
+        The zeros of the characteristic polynomial in z are the poles of the loop.
         """
-        delayed_numerator = np.append(np.zeros(delay), self.numerator)
-        return np.asarray(polyadd(self.denominator, delayed_numerator), np.float64)
+        return np.asarray(polyadd(self.denominator, self.numerator), np.float64)
 
     def largest_pole(self) -> float:
         """Return the largest magnitude of a pole of the loop; below 1, the loop is stable."""
-        return float(np.abs(np.roots(self.characteristic(self.delay))).max())
+        return float(np.abs(np.roots(self.characteristic)).max())
 
-    def is_stable(self, delay: int) -> bool:
-        """Return whether the loop is stable if the delay d of the plant is `delay` samples.
+    def is_stable(self) -> bool:
+        """Return whether the loop is stable: whether all poles have magnitudes below 1.
 
-        A loop is stable if all poles lie inside the unit circle. While z^-1 goes around the
-        unit circle once, the characteristic polynomial goes around 0 once for each pole outside
-        the unit circle (argument principle).
+        While z^-1 goes around the unit circle once, the characteristic polynomial goes around 0
+        once for each pole outside the unit circle (argument principle).
         """
         # Values of the characteristic polynomial at equidistant points on the unit circle.
-        values = np.fft.fft(self.characteristic(delay), CIRCLE_POINTS)
+        values = np.fft.fft(self.characteristic, CIRCLE_POINTS)
         if not values.all():  # A pole lies on the circle.
             return False
         turns = np.angle(np.roll(values, -1) / values).sum() / (2.0 * math.pi)
@@ -371,28 +366,11 @@ class LinearLoop:
         Ms is the largest magnitude of the sensitivity function 1 / (1 + L) at the frequencies
         in `FREQUENCIES`, where L is the transfer function from the error to the temperature.
         """
-        if not self.is_stable(self.delay):
+        if not self.is_stable():
             return math.inf
         inverse_z = np.exp(-1j * FREQUENCIES)
-        characteristic = self.characteristic(self.delay)
-        sensitivity = polyval(inverse_z, self.denominator) / polyval(inverse_z, characteristic)
-        return float(np.abs(sensitivity).max())
-
-    def stable_delays(self) -> tuple[int, int] | None:
-        """Return the ends of the range of delays, in samples, with which the loop is stable.
-
-        The range of delays contains the delay of the plant. `stable_delays` does not examine
-        delays above `LONGEST_DELAY`. If the loop is unstable with the delay of the plant, None
-        is returned.
-        """
-        if not self.is_stable(self.delay):
-            return None
-        shortest = longest = self.delay
-        while shortest > 0 and self.is_stable(shortest - 1):
-            shortest -= 1
-        while longest < LONGEST_DELAY and self.is_stable(longest + 1):
-            longest += 1
-        return shortest, longest
+        characteristic = polyval(inverse_z, self.characteristic)
+        return float(np.abs(polyval(inverse_z, self.denominator) / characteristic).max())
 
 
 def time_constant_for(
