@@ -235,6 +235,15 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     `time_constant_factor` at the present sample. For each argument that is a range, the info of
     `reset` also holds the sampled number, under the argument's name; a sampled delay is an int.
 
+    ## Copies
+
+    A deep copy or a pickle in mid-episode continues the same episode: noise, load and set
+    points to come are those of the original, even if the copy gets another `np_random`. A
+    planner that tries actions on copies therefore foresees them, which no controller of a real
+    plant can. A planner should try actions in an environment of its own, made without noise and
+    load and with the set point that it expects, to which it applies every action that the plant
+    receives.
+
     ## Rendering
 
     | `render_mode` | `render` |
