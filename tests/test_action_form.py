@@ -29,6 +29,10 @@ def make(**arguments):
         # The policy's dead zone is compensated, whatever that of the plant is.
         *(({"dead_zone": zone, "max_move": 2, "compensated_dead_zone": 6}, [0.25], [8])
           for zone in (0.0, [1.0, 4.0], 5.0)),
+        # The flow between the dead zone and each limit is shared out evenly.
+        ({"u_max": 20, "max_move": 1, "compensated_dead_zone": 5}, [-0.2, 0.4], [-6.5, 7.25]),
+        # The smallest change leaves a dead zone whose edge float32 does not hold.
+        ({"dead_zone": 7.0, "compensated_dead_zone": 7.0}, [1e-9, -2e-9], [7, -7]),
         # A limit within the dead zone is reached.
         ({"u_min": -3, "max_move": 2, "compensated_dead_zone": 5.0}, [-0.1], [-3]),
     ],
@@ -46,6 +50,15 @@ def test_past_actions_are_those_that_command_the_flow():
     env.step(np.ones(1, np.float32))
     observation, *_ = env.step(np.ones(1, np.float32))
     assert observation[-2:] == pytest.approx([0.8, 0.4])
+
+
+def test_a_past_action_commands_the_same_flow_in_the_other_form():
+    env = make(action_window=1, compensated_dead_zone=5.0)
+    flow = gymnasium.make("MiddlePoint-v0")
+    env.reset()
+    flow.reset()
+    observation, *_, info = env.step(np.array([0.123], np.float32))
+    assert flow.step(observation[-1:])[-1] == info  # to the bit
 
 
 def test_the_cost_of_a_move_is_that_of_the_commanded_flow():

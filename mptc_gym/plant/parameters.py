@@ -35,9 +35,8 @@ class PlantNumbers(Generic[Value]):
 
     In the arguments of the environment, each field of `PlantNumbers` is one number, or a range
     [low, high] from which each reset of the environment samples one number; only `u_min` and
-    `u_max` are always one number. During an episode,
-    each field of `PlantNumbers` is a float for one plant, or an array or tensor for many
-    plants.
+    `u_max` are always one number. During an episode, each field of `PlantNumbers` is a float
+    for one plant, or an array or tensor for many plants.
 
     If field i of `PlantNumbers` is a range, a reset computes the value of field i from random
     number i of the episode. The order of the fields of `PlantNumbers` must therefore never
