@@ -159,9 +159,22 @@ def plot_responses(
     agents = list(errors_drawn.index)
     by_label = {controllers[agent].label: errors[agent] for agent in agents}
     title = f"{scenario.title}: {responses_finding(by_label)}"
-    height = 1.2 + 1.25 * len(agents)  # inches: title and legend, and the rows
+    height = 1.4 + 1.25 * len(agents)  # inches: title and legend, and the rows
     with open_picture(path, height, title) as figure:
-        grid = figure.subplots(len(agents), 2, sharex=True, sharey="col", squeeze=False)
+        # Matplotlib would need more time to place the panels than to draw them.
+        figure.set_layout_engine("none")
+        heading = 0.4 + 0.16 * len(figure.get_suptitle().splitlines())  # inches
+        edges = {
+            "left": 0.11, "right": 0.98, "bottom": 0.8 / height, "top": 1.0 - heading / height
+        }  # fmt: skip
+        grid = figure.subplots(
+            len(agents),
+            2,
+            sharex=True,
+            sharey="col",
+            squeeze=False,
+            gridspec_kw={**edges, "hspace": 0.4, "wspace": 0.3},
+        )
         for (temperature_axes, flow_axes), agent in zip(grid, agents, strict=True):
             rows = responses[responses["agent"] == agent]
             colour, _ = controllers[agent].look
@@ -176,7 +189,7 @@ def plot_responses(
         figure.legend(
             list(entries.values()),
             list(entries),
-            loc="outside lower center",
+            loc="lower center",
             ncols=4,
             columnspacing=1.5,
         )
