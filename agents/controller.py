@@ -142,7 +142,7 @@ class Controller(ABC):
         # batch of loops, and None while both are allowed.
         self._loop_shape: tuple[int, ...] | None = None
 
-    def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
+    def check_environment(self, parameters: Any, n: int) -> None:
         """Raise a ValueError if the controller does not fit the plants of an environment.
 
         `mptc_gym.evaluate` calls this method before an evaluation, so that a wrong limit or
@@ -153,9 +153,6 @@ class Controller(ABC):
         parameters
             Arguments of the environment, a `mptc_gym.Parameters`. An argument that is sampled
             at each reset is a range (low, high).
-        wrapped
-            Names of the environment's wrappers that change observations or actions; "" if there
-            are none.
         n
             Number of plants.
 
@@ -163,7 +160,7 @@ class Controller(ABC):
         ------
         ValueError
             If the controller does not fit the action form, the flow limits, the observations or
-            the number of the plants, or if `wrapped` is not empty.
+            the number of the plants.
         """
         action_form = getattr(self, "action", "flow")
         if parameters.action != action_form:
@@ -189,11 +186,6 @@ class Controller(ABC):
                     f"error_window={parameters.error_window}"
                 )
             first += window
-        if wrapped:
-            raise ValueError(
-                f"env must not be wrapped in a wrapper that changes observations or actions, "
-                f"got {wrapped}"
-            )
 
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
         """Return the action for an observation; call this method once per sample.

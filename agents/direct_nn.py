@@ -202,13 +202,13 @@ class DirectNNController(Controller):
         # add long rows.
         self._arrays = arrays
 
-    def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
+    def check_environment(self, parameters: Any, n: int) -> None:
         """Raise a ValueError if the controller does not fit the plants of an environment.
 
         The arguments are described in `Controller.check_environment`. In addition to the checks
         of `Controller`, `num_envs` must equal the number of plants, `n`.
         """
-        super().check_environment(parameters, wrapped, n)
+        super().check_environment(parameters, n)
         if self.num_envs != n:
             raise ValueError(
                 f"policy must have num_envs={n}, one loop per episode, got {self.num_envs}"

@@ -234,14 +234,14 @@ class PolicyNetwork(Controller):
             arrays[f"b{i}"] = b
         write_arrays(path, about=json.dumps(settings), **arrays)
 
-    def check_environment(self, parameters: Any, wrapped: str, n: int) -> None:
+    def check_environment(self, parameters: Any, n: int) -> None:
         """Raise a ValueError if the network does not fit the plants of an environment.
 
         The arguments are described in `Controller.check_environment`. In addition to the checks
         of `Controller`, the environment must have the observations and the `max_move` of the
         network's training.
         """
-        super().check_environment(parameters, wrapped, n)
+        super().check_environment(parameters, n)
         names = [*WINDOWS, "max_move"] if self.action == "change" else WINDOWS
         expected = {name: self.interface[name] for name in names}
         received = {name: getattr(parameters, name) for name in names}

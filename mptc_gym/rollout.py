@@ -287,7 +287,7 @@ def _check_fit(policy: Any, plants: Plants, *, is_made_by_user: bool) -> None:
     """Raise a ValueError if a controller or a model was made for other environments."""
     parameters = parameters_of(plants)
     if hasattr(policy, "check_environment"):
-        policy.check_environment(parameters, "", plants.num_envs)
+        policy.check_environment(parameters, plants.num_envs)
     training = training_of(policy)
     if training is not None and is_made_by_user:
         expected, received = _interface(training), _interface(plants)
