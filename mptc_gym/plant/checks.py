@@ -22,7 +22,6 @@ REWARDS: Final = ("quadratic", "absolute")
 ACTIONS: Final = ("flow", "change")
 _COEFFICIENTS = "a list of one or more numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # NumPy takes a dtype faster than the type np.float64
-_LONGEST_REPR = 80  # characters of a value in an error message, to keep the message readable
 # The exceptions that NumPy, PyTorch and Python raise for a value that is not a number.
 NOT_A_NUMBER = AttributeError, TypeError, ValueError, OverflowError, RuntimeError
 
@@ -38,19 +37,14 @@ def reject(name: str, value: object, allowed: str) -> NoReturn:
 def shorten(value: object) -> str:
     """Return the repr of a value for an error message, cut to the first 80 characters.
 
-    A text that is cut ends with "..." and, for a list, a tuple or an array, with the number of
-    elements or the shape.
+    To the cut text of an array or a tensor, the shape is added.
     """
-    text = repr(value)
-    length = ""
-    if isinstance(value, list | tuple):
-        length = f" ({len(value)} elements)"
-    if hasattr(value, "shape"):  # the repr of an array or of a tensor has several lines
-        text = " ".join(text.split())
-        length = f" (shape {tuple(value.shape)})"
-    if len(text) <= _LONGEST_REPR:
-        return text
-    return f"{text[:_LONGEST_REPR]}...{length}"
+    text = " ".join(repr(value).split())  # the repr of an array has several lines
+    if len(text) > 80:
+        text = f"{text[:80]}..."
+        if hasattr(value, "shape"):
+            text += f" (shape {tuple(value.shape)})"
+    return text
 
 
 def one_action(action: Any) -> float:
@@ -66,14 +60,10 @@ def one_action(action: Any) -> float:
     ValueError
         If the action is not one finite number.
     """
-    try:
-        array = action if hasattr(action, "item") else np.asarray(action)
-        checked = float(array.item() - 0.0)  # subtracting 0.0 fails for text such as "0.3"
-    except NOT_A_NUMBER:
-        checked = math.nan
-    if not math.isfinite(checked):
+    array = _as_float64(action)
+    if array is None or array.size != 1 or not math.isfinite(array.item()):
         reject("action", action, "one finite number, shape (1,)")
-    return checked
+    return array.item()
 
 
 def many_actions(
@@ -135,9 +125,8 @@ def to_python(value: Any) -> Any:
 
 def is_number(value: Any) -> bool:
     """Return whether a value is a real number from -1e9 to 1e9, and not a bool."""
-    if not isinstance(value, Real) or isinstance(value, bool):
-        return False
-    return bool(-LARGEST_NUMBER <= value <= LARGEST_NUMBER)
+    is_real = isinstance(value, Real) and not isinstance(value, bool)
+    return is_real and bool(-LARGEST_NUMBER <= value <= LARGEST_NUMBER)
 
 
 def is_count(value: Any, minimum: int = 0) -> bool:
@@ -161,11 +150,7 @@ share_of_range = partial(number, low=1e-9, high=2.0)  # in halves of the range
 
 
 def count(name: str, value: Any, minimum: int, maximum: int = LARGEST_NUMBER) -> int:
-    """Return the value of an argument as an int.
-
-    A ValueError is raised unless `value` is an integer from `minimum` to `maximum`, both
-    included.
-    """
+    """Return an integer as an int; ValueError unless it is from `minimum` to `maximum`."""
     if not is_count(value, minimum) or value > maximum:
         reject(name, value, f"an integer from {minimum} to {maximum:,}")
     return int(value)
@@ -176,19 +161,10 @@ duration = partial(count, minimum=1)  # in samples
 
 
 def numbers(name: str, value: Any, allowed: str = _COEFFICIENTS) -> tuple[float, ...]:
-    """Return an argument's value, a list or tuple of numbers, as a tuple of floats.
-
-    A ValueError, whose message contains the text `allowed`, is raised unless `value` is a list
-    or tuple of one or more numbers within +-1e9.
-    """
-    if not isinstance(value, list | tuple) or not value:
+    """Return a list or tuple of one or more numbers as floats; ValueError for others."""
+    is_list = isinstance(value, list | tuple) and len(value) > 0
+    if not is_list or not all(map(is_number, value)):
         reject(name, value, allowed)
-    for i, element in enumerate(value):
-        if not is_number(element):
-            raise ValueError(
-                f"{name} must be {allowed}, got {shorten(value)}, where element {i} is "
-                f"{shorten(element)}"
-            )
     return tuple(map(float, value))
 
 
@@ -218,14 +194,12 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     A float is a constant set point, in degC. A tuple holds a set point for each sample, in
     degC. A ValueError is raised if `value` is not a valid set point.
     """
-    allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
-    if isinstance(value, list | tuple):
-        return numbers(name, value, allowed)
     if isinstance(value, str) and value in SETPOINTS:
         return value
-    if not is_number(value):
-        reject(name, value, allowed)
-    return number(name, value)
+    if is_number(value):
+        return number(name, value)
+    allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
+    return numbers(name, value, allowed)
 
 
 def number_or_range(check: Callable[[str, Any], float], name: str, value: Any) -> Number:

@@ -248,8 +248,7 @@ class Parameters(PlantNumbers[Number]):
         self._check_actuator()
         if self.changes_time_constant:
             self._check_time_constant()
-        is_stable = abs(slowest_pole(self.a)) < 1.0
-        if self.is_disturbed and not is_stable:
+        if self.is_disturbed and not abs(slowest_pole(self.a)) < 1.0:
             values = self.disturbance_amplitude, self.disturbance_walk_variance
             allowed = "0 for this a: the plant is not stable, so it has no steady state"
             reject(", ".join(_LOAD_ARGUMENTS), values, allowed)
@@ -267,8 +266,7 @@ class Parameters(PlantNumbers[Number]):
         if u_min >= u_max:
             reject("u_min", u_min, f"below u_max = {u_max}")
         largest_command = max(abs(u_min), abs(u_max))
-        _, largest_dead_zone = self.range_of("dead_zone")
-        if largest_dead_zone > largest_command:
+        if self.range_of("dead_zone")[1] > largest_command:
             allowed = "small enough for some command to pass, at most max(|u_min|, |u_max|)"
             reject("dead_zone", self.dead_zone, f"{allowed} = {largest_command:g}")
 
@@ -279,18 +277,16 @@ class Parameters(PlantNumbers[Number]):
         must lie between 0 and 1, and no factor or drift of the time constant may make this pole
         negative.
         """
-        names = "time_constant_factor", "time_constant_drift"
-        pole = slowest_pole(self.a)
-        rate = 1.0 - pole.real  # 1 / time constant, per sample
-        lowest_factor = self.lowest.time_constant_factor
-        lowest_drift = self.lowest.time_constant_drift
+        names = "time_constant_factor, time_constant_drift"
         values = self.time_constant_factor, self.time_constant_drift
+        pole = slowest_pole(self.a)
         if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
             allowed = f"1 for this a, whose slowest pole is {pole:g}, not one between 0 and 1"
-            reject(", ".join(names), values, allowed)
-        if lowest_factor * min(lowest_drift, 1.0) < rate:
+            reject(names, values, allowed)
+        rate = 1.0 - pole.real  # 1 / time constant, per sample
+        if self.lowest.time_constant_factor * min(self.lowest.time_constant_drift, 1.0) < rate:
             allowed = f"such that the factor is never below {rate:g}, where the pole is 0"
-            reject(", ".join(names), values, allowed)
+            reject(names, values, allowed)
 
     def range_of(self, name: str) -> tuple[float, float]:
         """Return the range (low, high) of the field `name` of `PlantNumbers`.
@@ -299,10 +295,7 @@ class Parameters(PlantNumbers[Number]):
         number.
         """
         value = getattr(self, name)
-        if isinstance(value, tuple):
-            low, high = value
-            return low, high
-        return value, value
+        return value if isinstance(value, tuple) else (value, value)
 
     @cached_property
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -345,14 +338,12 @@ class Parameters(PlantNumbers[Number]):
         return self.setpoint_window, self.error_window, self.output_window, self.action_window
 
 
+# The dataclass field of every argument, by name.
 ARGUMENTS: Final[dict[str, Any]] = {argument.name: argument for argument in fields(Parameters)}
-"""The dataclass field of every argument, by name."""
-
+# Index of each field of `PlantNumbers`, and of the field's random number, by name.
 PLANT_NUMBERS: Final = {number.name: i for i, number in enumerate(fields(PlantNumbers))}
-"""Index of each field of `PlantNumbers`, and of the field's random number, by name."""
-
+# The names of the arguments that can be a range [low, high].
 CAN_BE_RANGES: Final = PLANT_NUMBERS.keys() - {"u_min", "u_max"}
-"""The names of the arguments that can be a range [low, high]."""
 
 
 def argument_table() -> str:
