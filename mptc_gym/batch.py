@@ -244,11 +244,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         return infos
 
     def _checked_mask(self, options: Mapping[str, Any]) -> Mask:
-        """Return the mask of the plants to reset: `options["reset_mask"]`, or all plants.
-
-        A ValueError is raised if `reset_mask` is not a bool array of shape (num_envs,) with at
-        least one True.
-        """
+        """Return the mask of the plants to reset: `options["reset_mask"]`, or all plants."""
         if "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_)
         mask = options["reset_mask"]

@@ -154,10 +154,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return tuple(map(rendering.frame, self._records.values()))
 
     def _advance(self, a: Values) -> tuple[Observations, Values, Mask, Mask, Infos]:
-        """Move all plants by one sample, and return the results of a step that ends no episode.
-
-        `a` holds the checked normalised actions, shape (num_envs,).
-        """
+        """Move all plants by one sample, and return what `step` returns if no episode ends."""
         # The speed of the environment depends on `_advance`. With few plants, the number of
         # NumPy calls in `_advance` determines the speed.
         if self._wanted_flows is not None:
@@ -238,12 +235,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return reading
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
-        """Begin an episode of the plants in `mask`, and return infos at sample k = 0.
-
-        The returned dict leaves out infos that are always 0 at sample k = 0. Each info is an
-        array of shape (num_envs,), in which the elements of plants outside `mask` have no
-        meaning.
-        """
+        """Begin an episode of the plants in `mask`, and return the infos that are not 0."""
         which = np.flatnonzero(mask)  # the indices of the plants
         numbers = self._plant_sampler.sample([self._streams[i] for i in which.tolist()])
         self._plants.reset(which, numbers)
@@ -283,11 +275,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return values.copy()
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Restart the random number streams of the plants in `mask`, each from its own seed.
-
-        The streams of a plant without a seed continue; at the first reset, the streams of this
-        plant start from a random seed.
-        """
+        """Restart the random number streams of the plants in `mask` that have a seed."""
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():
             seed_of_plant = seeds[i]
@@ -298,12 +286,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
                 self._streams[i] = RandomStreams.of_seed(int(seed_of_plant))
 
     def _checked_seeds(self, seed: Any) -> Sequence[Any]:
-        """Return a seed for each plant: an integer, or None for no new seed.
-
-        `seed` is None, an integer, or a list with an integer or None for each plant. If `seed`
-        is an integer, plant i gets the seed `seed` + i. Any other value of `seed` raises a
-        ValueError.
-        """
+        """Return a seed or None for each plant; plant i of an integer seed gets seed + i."""
         n = self.num_envs
         if seed is None:
             return [None] * n

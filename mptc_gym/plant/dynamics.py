@@ -499,10 +499,7 @@ class PlantBatch:
         self._u_max = np.full(self._num_envs, u_max)
 
     def _update_dynamics(self) -> None:
-        """Update coefficients and drift factors to the present sample of each plant.
-
-        A drifting gain or time constant changes every `DRIFT_INTERVAL` samples of an episode.
-        """
+        """Update coefficients and drift factors to the present sample of each plant."""
         ages = self._clock - self._starts  # the present sample k of each plant's episode
         ages_at_change = ages // DRIFT_INTERVAL * DRIFT_INTERVAL  # at the latest change
         factors = self._dynamics.factors(self.numbers, ages_at_change)

@@ -20,11 +20,7 @@ _LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
 
 def _argument(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
-    """Return a dataclass field for one argument of the environment.
-
-    The metadata of the dataclass field hold the arguments `check`, `unit` and `meaning` by
-    name. `check` is a function that takes the name and the value of the argument.
-    """
+    """Return a dataclass field for one argument of the environment."""
     metadata = {"check": check, "unit": unit, "meaning": meaning}
     return field(default=default, metadata=metadata)
 
@@ -257,11 +253,7 @@ class Parameters(PlantNumbers[Number]):
             reject(names, self.windows, "such that the observation has at least one element")
 
     def _check_actuator(self) -> None:
-        """Raise a ValueError if the limits of the flow or the dead zone do not fit together.
-
-        `u_min` must be below `u_max`, and `dead_zone` must not exceed max(|u_min|, |u_max|), so
-        that some flow command from `u_min` to `u_max` can pass the dead zone.
-        """
+        """Raise a ValueError if limits of the flow and dead zone do not fit together."""
         u_min, u_max = self.lowest.u_min, self.lowest.u_max
         if u_min >= u_max:
             reject("u_min", u_min, f"below u_max = {u_max}")
@@ -271,12 +263,7 @@ class Parameters(PlantNumbers[Number]):
             reject("dead_zone", self.dead_zone, f"{allowed} = {largest_command:g}")
 
     def _check_time_constant(self) -> None:
-        """Raise a ValueError if the polynomial `a` allows no change of the time constant.
-
-        The slowest pole of 1 / A(z^-1), with the polynomial A of equation (28) of the paper,
-        must lie between 0 and 1, and no factor or drift of the time constant may make this pole
-        negative.
-        """
+        """Raise a ValueError if `a` does not allow these changes of the time constant."""
         names = "time_constant_factor, time_constant_drift"
         values = self.time_constant_factor, self.time_constant_drift
         pole = slowest_pole(self.a)
