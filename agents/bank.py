@@ -13,7 +13,6 @@ models.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -61,23 +60,6 @@ LEAST_LOGARITHM: Final = -30.0
 # Samples between updates of the models' gains and probabilities. These updates take the most
 # computing time.
 ESTIMATE_INTERVAL: Final = 2
-
-
-@dataclass(frozen=True)
-class Prior:
-    """Candidate models of a plant, and the prior probabilities of the models.
-
-    There is one candidate model for every pair of a delay and a time constant.
-    """
-
-    time_constants: Array
-    """Time constants of the models, samples, shape (time constants,)."""
-    delays: NDArray[np.intp]
-    """Delays d of the models, in samples, as in equation (28) of the paper: successive integers
-    in rising order, shape (delays,)."""
-    log_probabilities: Array
-    """Logarithms of the prior probabilities of the models, shape (delays, time constants). The
-    probabilities need not sum to 1."""
 
 
 def model_coefficients(time_constants: Array) -> tuple[Array, Array, Array, Array]:
@@ -176,8 +158,14 @@ class Bank:
 
     Parameters
     ----------
-    prior
-        Candidate models and their prior probabilities.
+    time_constants
+        Candidate time constants, samples, shape (time constants,).
+    delays
+        Candidate delays d, in samples, as in equation (28) of the paper: successive integers in
+        rising order, shape (delays,).
+    log_probabilities
+        Logarithms of the prior probabilities of the models, shape (delays, time constants). The
+        probabilities need not sum to 1.
     n
         Number of plants.
 
@@ -204,26 +192,30 @@ class Bank:
         sample k, as means that are weighted by the probabilities of the models, shape (2, n).
     """
 
-    def __init__(self, prior: Prior, n: int) -> None:
-        time_constants = _for_plants(prior.time_constants, n)
-        delays = _for_plants(prior.delays, n)
-        self._delays = delays
-        self._log_constants = np.log(time_constants)
-        self._poles = np.exp(-1.0 / time_constants)
-        self._fading = self._poles ** (delays[:, np.newaxis] + 1.0)
-        self._log_priors = _for_plants(prior.log_probabilities, n)
-        self.models = UndelayedModels(time_constants)
+    def __init__(
+        self,
+        time_constants: Array,
+        delays: NDArray[np.intp],
+        log_probabilities: Array,
+        n: int,
+    ) -> None:
+        constants = _for_plants(time_constants, n)
+        self._delays = _for_plants(delays, n)
+        self._log_constants = np.log(constants)
+        self._poles = np.exp(-1.0 / constants)
+        self._fading = self._poles ** (self._delays[:, np.newaxis] + 1.0)
+        self._log_priors = _for_plants(log_probabilities, n)
+        self.models = UndelayedModels(constants)
         self._whiten_output = Whitening((n,))
-        self._whiten_response = Whitening(time_constants.shape)
+        self._whiten_response = Whitening(constants.shape)
         # Outputs s(k) of the models without delay, and whitened outputs, at the latest samples
         # k, oldest first, as far back as the shortest delay.
-        shortest_delay = int(prior.delays[0])
-        rest = np.zeros_like(time_constants), np.zeros_like(time_constants)
-        self._in_transit = deque([rest] * (shortest_delay + 1), maxlen=shortest_delay + 1)
+        length = int(delays[0]) + 1
+        rest = np.zeros_like(constants), np.zeros_like(constants)
+        self._in_transit = deque([rest] * length, maxlen=length)
         # Outputs s(k - d) in order of the delay d, from the shortest delay on. The last element
         # is the output of the longest delay at the previous sample.
-        delay_count = len(delays)
-        self._delayed = np.zeros((delay_count + 1, *time_constants.shape), np.float32)
+        self._delayed = np.zeros((len(delays) + 1, *constants.shape), np.float32)
         # The whitened s(k - d) of each model.
         self._regressors = np.zeros_like(self._log_priors)
         # Exponentially weighted sums over past samples: squared regressors, regressors times

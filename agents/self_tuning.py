@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.bank import Bank, Prior
+from agents.bank import Bank
 from agents.controller import ModelBasedController, from_0, positive
 from agents.hedge import RandomSetpoint
 from agents.law import Law
@@ -130,11 +130,9 @@ class SelfTuningController(ModelBasedController):
         # The unit of temperatures is the steady temperature change for half the flow range.
         self._unit_flow = math.copysign((self.u_max - self.u_min) / 2.0, self.gain)
         self._unit_temperature = self.gain * self._unit_flow
-        self._prior = self._prior_of_plant()
-        self._random_setpoint = self._setpoint_distribution()
 
-    def _prior_of_plant(self) -> Prior:
-        """Return the candidate models of the plant and their prior probabilities."""
+    def _new_bank(self, n: int) -> Bank:
+        """Return the candidate models of n plants, with their prior probabilities."""
         likely = self.delay / self._interval
         if self.delay_range is None:
             shortest = SHORTEST_DELAY * likely
@@ -148,10 +146,11 @@ class SelfTuningController(ModelBasedController):
         # distribution.
         delay_logarithms = -0.5 * np.square((delays + 1.0 - likely) / spread)
         constant_logarithms = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
-        return Prior(
+        return Bank(
             time_constants=self._time_constant * TIME_CONSTANTS,
             delays=delays,
             log_probabilities=delay_logarithms[:, np.newaxis] + constant_logarithms,
+            n=n,
         )
 
     def _setpoint_distribution(self) -> RandomSetpoint | None:
@@ -195,8 +194,8 @@ class SelfTuningController(ModelBasedController):
         if self.dead_zone > 0.0:
             edge = self.dead_zone / abs(self._unit_flow) + CLEARANCE
         low, high = sorted([self.u_min / self._unit_flow, self.u_max / self._unit_flow])
-        self._bank = Bank(self._prior, n)
-        self._law = Law(self._bank, n, edge, (low, high), self._random_setpoint)
+        self._bank = self._new_bank(n)
+        self._law = Law(self._bank, n, edge, (low, high), self._setpoint_distribution())
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the commands u(k), t/h, shape (loops,), and update the estimates.

@@ -9,7 +9,6 @@ from agents.bank import (
     GAIN_SPREAD,
     NOISE_COLOUR,
     Bank,
-    Prior,
     model_coefficients,
 )
 from agents.hedge import RandomSetpoint
@@ -68,12 +67,8 @@ def test_the_steady_state_of_the_model_is_that_of_the_step_test():
 
 
 def test_the_response_of_a_single_model_is_that_of_its_difference_equation(rng):
-    single = Prior(
-        time_constants=np.array([CONSTANT]),
-        delays=np.array([DELAY]),
-        log_probabilities=np.zeros((1, 1)),
-    )
-    bank, flows = Bank(single, 1), rng.uniform(-1.0, 1.0, 80)
+    bank = Bank(np.array([CONSTANT]), np.array([DELAY]), np.zeros((1, 1)), n=1)
+    flows = rng.uniform(-1.0, 1.0, 80)
     expected = simulated(flows)
     for k, flow in enumerate(flows):
         bank.observe(np.array([expected[k]], np.float32))
