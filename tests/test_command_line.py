@@ -58,7 +58,6 @@ REFUSED = {
         (["--agent", "mine=none.json"], "No such file or directory: 'none.json'"),
         (["--agents"], "name at least one controller"),
         (["--scenarios", "circle"], "no 'circle'"),
-        (["--scenarios"], "--scenarios: name at least one case"),
         (["--runs", "2e3"], 'for --runs: unable to convert "2e3" into int'),
         (["--preset", "paper", "--presets"], "--presets cannot be combined with --plant"),
         (["--preset", "paper", "--scenarios", "load"], "no 'load'; choose from square, con"),

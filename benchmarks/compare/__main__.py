@@ -50,7 +50,7 @@ class Options:
     """A controller of your own, which runs in addition to those of --agents. Its form is
     NAME=MODULE:FACTORY; NAME=gains.json for a file of benchmarks.tune; or NAME=FILE.npz for a
     file of benchmarks.train. The same name again adds another training of the controller."""
-    scenarios: Annotated[Names | None, Parameter(help=_SCENARIOS_HELP)] = None
+    scenarios: Annotated[Names, Parameter(help=_SCENARIOS_HELP)] = ()
     plant: PlantOptions = field(default_factory=PlantOptions)
     presets: bool = False
     """Run a case for each preset of the environment instead of the default cases."""
@@ -120,11 +120,8 @@ def cases(options: Options) -> tuple[str, dict[str, Scenario]]:
         folder_name, available = "compare-plant", dict(options.plant.cases(SCENARIOS))
     else:
         folder_name, available = "compare", SCENARIOS
-    wanted = list(available) if options.scenarios is None else options.scenarios
-    scenarios = {name: available[name] for name in known("--scenarios", wanted, available)}
-    if not scenarios:
-        raise CommandError("--scenarios: name at least one case")
-    return folder_name, scenarios
+    wanted = known("--scenarios", options.scenarios or list(available), available)
+    return folder_name, {name: available[name] for name in wanted}
 
 
 def that_fit(

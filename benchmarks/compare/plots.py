@@ -5,7 +5,7 @@ A score is 0 for an idle valve and 1 for the least possible error.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,13 @@ from benchmarks.lib.statistics import Estimate, as_text
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 
-# The ends of the axis of scores. The axis is logarithmic in 1 minus the score, so that a score
-# of 1 would lie at infinity. A score beyond an end of the axis is drawn at the end.
-LOWEST_SCORE = -0.5
-HIGHEST_SCORE = 0.999
-SCORE_TICKS = LOWEST_SCORE, 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, HIGHEST_SCORE
+# Ticks of the axis of scores. The axis is logarithmic in 1 minus the score, so that a score of
+# 1 would lie at infinity. A score beyond an end of the axis is drawn at the end.
+SCORE_TICKS = 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999
 SCORE_LABEL = (
     "score: 0 for an idle valve, 1 for the least possible error\n"
-    "(axis logarithmic in 1 minus the score, to show small differences near 1)"
+    "(axis logarithmic in 1 minus the score, to show small differences near 1)\n"
+    "large marker and number: mean over all cases; small tick: one case"
 )
 
 # The look of the band from the 10th to the 90th percentile of the runs.
@@ -60,76 +59,36 @@ def plot_scores(
         The PNG file.
     """
     labels = [controllers[agent].label for agent in scores]
-    drawn_scores = [score.value for score in scores.values()]
+    values = [as_text(score.value, ".3f") for score in scores.values()]
+    title = f"{labels[0]} has the highest score, {values[0]}"
     height = 1.5 + 0.3 * len(scores)  # inches: title and axis, and the rows
-    finding = scores_finding(dict(zip(labels, drawn_scores, strict=True)))
-    with open_picture(path, height, finding) as figure:
+    with open_picture(path, height, title) as figure:
         axes = figure.subplots()
         for row, (agent, score) in enumerate(scores.items()):
             colour, marker = controllers[agent].look
             scores_of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
             scenario_scores = [float(np.mean(values)) for values in scores_of_runs]
-            drawn_scores += scenario_scores
             rows = np.full(len(scenario_scores), row)
             tick: Any = {"color": colour, "marker": "|", "ms": 9, "mew": 1.4, "ls": ""}
             axes.plot(distance(scenario_scores), rows, **tick)
             axes.plot(distance(score.value), row, color=colour, marker=marker, ms=6.5)
             right_of_axes = (1.01, row)
-            text = as_text(score.value, ".3f")
+            text = values[row]
             axes.annotate(text, right_of_axes, xycoords=("axes fraction", "data"), va="center")
         axes.set_yticks(range(len(scores)), labels)
         axes.set_ylim(len(scores) - 0.5, -0.5)  # The first controller has the top row.
-        scale_by_score(axes, drawn_scores)
-        caption = SCORE_LABEL
-        if estimates["scenario"].nunique() > 1:
-            caption += "\nlarge marker and number: mean over all cases; small tick: one case"
-        axes.set_xlabel(caption)
-
-
-def scores_finding(scores: Mapping[str, float]) -> str:
-    """Return the title of the picture of scores, which names the highest and lowest scores.
-
-    `scores` has the score of each controller by label, the highest score first.
-    """
-    names = list(scores)
-    values = [as_text(score, ".3f") for score in scores.values()]
-    if len(scores) == 1:
-        return f"{names[0]} has a score of {values[0]}"
-    finding = f"{names[0]} has the highest score ({values[0]})"
-    if len(scores) > 2:
-        finding += f", {names[1]} the second highest ({values[1]})"
-    return f"{finding}, and {names[-1]} the lowest ({values[-1]})"
+        axes.set_xscale("log")
+        lowest, *others, highest = [f"{tick:g}" for tick in SCORE_TICKS]
+        tick_labels = [f"{AT_MOST} {lowest}", *others, f"{AT_LEAST} {highest}"]
+        axes.set_xticks(distance(SCORE_TICKS), tick_labels)
+        axes.set_xlim(1.15, 0.00087)
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_xlabel(SCORE_LABEL)
 
 
 def distance(scores: ArrayLike) -> NDArray[np.float64]:
-    """Return 1 minus each score, an array of the shape of `scores`, for a logarithmic axis.
-
-    A score below `LOWEST_SCORE` is replaced by `LOWEST_SCORE`, and a score above
-    `HIGHEST_SCORE` by `HIGHEST_SCORE`.
-    """
-    return 1.0 - np.clip(scores, LOWEST_SCORE, HIGHEST_SCORE)
-
-
-def scale_by_score(axes: Axes, scores: Sequence[float]) -> None:
-    """Make the x axis of a panel logarithmic in 1 minus the score, with scores at its ticks.
-
-    The axis begins at the highest of `SCORE_TICKS` below all `scores`, and ends at the lowest
-    tick above all `scores`. If a score is below the first of `SCORE_TICKS`, the label of the
-    first tick begins with the sign `AT_MOST`. If a score is above the last of `SCORE_TICKS`,
-    the label of the last tick begins with the sign `AT_LEAST`.
-    """
-    labels = [f"{score:g}" for score in SCORE_TICKS]
-    if min(scores) < LOWEST_SCORE:
-        labels[0] = f"{AT_MOST} {labels[0]}"
-    if max(scores) > HIGHEST_SCORE:
-        labels[-1] = f"{AT_LEAST} {labels[-1]}"
-    first = max(int(np.searchsorted(SCORE_TICKS, min(scores), side="right")) - 1, 0)
-    last = min(int(np.searchsorted(SCORE_TICKS, max(scores))), len(SCORE_TICKS) - 1)
-    ticks = distance(SCORE_TICKS[first : last + 1])
-    axes.set_xscale("log")
-    axes.set_xticks(ticks, labels[first : last + 1])
-    axes.set_xlim(1.15 * ticks[0], ticks[-1] / 1.15)
-    axes.xaxis.set_minor_locator(NullLocator())
+    """Return 1 minus each score, for a logarithmic axis from the first to the last tick."""
+    return 1.0 - np.clip(scores, SCORE_TICKS[0], SCORE_TICKS[-1])
 
 
 def plot_responses(
@@ -157,8 +116,12 @@ def plot_responses(
     """
     errors_drawn = errors[responses["agent"].unique()].sort_values(kind="stable")
     agents = list(errors_drawn.index)
-    by_label = {controllers[agent].label: errors[agent] for agent in agents}
-    title = f"{scenario.title}: {responses_finding(by_label)}"
+    title = scenario.title
+    if len(agents) > 1:
+        best = controllers[agents[0]].label
+        worst = controllers[agents[-1]].label
+        ratio = errors_drawn.iloc[-1] / errors_drawn.iloc[0]
+        title += f": {worst} has {ratio:.1f} times the mean error of {best}"
     height = 1.4 + 1.25 * len(agents)  # inches: title and legend, and the rows
     with open_picture(path, height, title) as figure:
         # Matplotlib would need more time to place the panels than to draw them.
@@ -185,7 +148,7 @@ def plot_responses(
         for axes in grid[-1]:
             axes.set_xlabel("time (min)")
             axes.set_xlim(0.0, responses["time_s"].max() / 60.0)
-        entries = _legend_of_responses(responses, scenario.parameters)
+        entries = _legend_of_responses(scenario.parameters)
         figure.legend(
             list(entries.values()),
             list(entries),
@@ -193,19 +156,6 @@ def plot_responses(
             ncols=4,
             columnspacing=1.5,
         )
-
-
-def responses_finding(errors: Mapping[str, float]) -> str:
-    """Return a clause of a title that compares the smallest and the largest mean error.
-
-    `errors` has the mean error of each controller by label, degC, the smallest error first.
-    """
-    labels = list(errors)
-    best = labels[0]
-    worst = labels[-1]
-    if best == worst:
-        return f"the mean error of {best} is {errors[best]:.3f} °C"
-    return f"{worst} has {errors[worst] / errors[best]:.1f} times the mean error of {best}"
 
 
 def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
@@ -224,30 +174,25 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
     """Draw the applied flow of the first run, the dead zone, and the limits of the flow.
 
     `rows` are the rows of one controller in the argument `responses` of `plot_responses`. If
-    the dead zone of the plant is a range of values, the picture shows the smallest value. If a
-    limit of the flow is a range, the picture shows the widest limit.
+    the dead zone of the plant is a range of values, the picture shows the smallest value.
     """
     dead_zone = plant.range_of("dead_zone")[0]
     axes.axhspan(-dead_zone, dead_zone, **DEAD_ZONE)
-    for limit in (plant.range_of("u_min")[0], plant.range_of("u_max")[1]):
+    for limit in (plant.range_of("u_min")[0], plant.range_of("u_max")[0]):
         axes.axhline(limit, **LIMIT)
     minutes = rows["time_s"] / 60.0
     axes.step(minutes, rows["applied_run"], where="post", color=colour, linewidth=1.0)
     axes.set_ylabel("applied flow\n(t/h)")
 
 
-def _legend_of_responses(responses: pd.DataFrame, plant: Parameters) -> dict[str, Any]:
+def _legend_of_responses(plant: Parameters) -> dict[str, Any]:
     """Return the legend of `plot_responses`: matplotlib's lines and patches, by their texts."""
-    runs_differ = bool((responses["output_p90"] > responses["output_p10"]).any())
     run = Line2D([], [], color="black", linewidth=1.2)
     band = Patch(color="black", **BAND)
-    entries: dict[str, Any] = {"set point": Line2D([], [], **SETPOINT)}
-    if runs_differ:
-        entries["line: first run; band: 10th to 90th percentile"] = (band, run)
-    elif plant.setpoint == "random":
-        entries["first run"] = run
     smallest = "smallest " if "dead_zone" in plant.ranges else ""
-    entries[f"{smallest}dead zone"] = Patch(**DEAD_ZONE)
-    widest = "widest " if {"u_min", "u_max"} & set(plant.ranges) else ""
-    entries[f"{widest}flow limits"] = Line2D([], [], **LIMIT)
-    return entries
+    return {
+        "set point": Line2D([], [], **SETPOINT),
+        "line: first run; band: 10th to 90th percentile": (band, run),
+        f"{smallest}dead zone": Patch(**DEAD_ZONE),
+        "flow limits": Line2D([], [], **LIMIT),
+    }

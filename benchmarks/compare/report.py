@@ -1,7 +1,7 @@
 """Write the tables, pictures and report of a comparison of controllers in scenarios."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,18 @@ from benchmarks.loop.scenarios import Scenario
 SCORE_TEXT = (
     "The error of a run is the mean of |e| over the samples, where e is the set point minus "
     "the temperature. An idle valve keeps the flow at 0 t/h. The score says which share of the "
-    "way from the error of an idle valve to the least possible error a controller covers. "
-    "The column 'score' has the mean score over all cases, with a 95 % confidence "
-    "interval, and the columns of the cases have the score in each case. The valve travel is "
-    "the sum of all changes of the applied flow in a run, as a mean over all runs."
+    "way from the error of an idle valve to the least possible error a controller covers, as a "
+    "mean over all cases. The column of a case has the error ratio: the mean error divided by "
+    "the least possible error, so 1.00 is best. In parentheses are 95 % confidence intervals. "
+    "The valve travel is the sum of all changes of the applied flow in a run, as a mean over "
+    "all runs."
 )
-RATIO_TEXT = (
-    "An error ratio of 1.00 is best. The first row has the least possible error of a "
-    "controller that does not know future set points. The mark * means that the plant settles "
-    "before each change of the set point, and that the least possible error assumes that each "
-    "change comes as a surprise. In a case with the mark *, a controller that has learnt when "
-    "the set point changes can have an error ratio below 1.00."
+LEAST_TEXT = (
+    "The first row has the least possible error of a controller that does not know future set "
+    "points. The mark * means that the plant settles before each change of the set point, and "
+    "that the least possible error assumes that each change comes as a surprise. In a case "
+    "with the mark *, a controller that has learnt when the set point changes can have an "
+    "error ratio below 1.00."
 )
 COSTS_TEXT = (
     "The column 'prior knowledge' says what a controller knows about the plant before a run, "
@@ -42,15 +43,15 @@ COSTS_TEXT = (
 )
 CASES_TEXT = (
     "Each case is the environment MiddlePoint-v0 with the arguments in the last column; all "
-    "other arguments have their default values."
+    "other arguments have their default values. Figs are the figures of the paper by Cui and "
+    "Shin (1992)."
 )
 SCREEN_TEXT = "score: 0 idle valve, 1 least possible error; cases: error / least possible error"
+LONGEST_LABEL = 16  # largest number of characters of a controller's label on the screen
 # Of more controllers than `MOST_PICTURED`, the pictures of responses over time show only users'
-# own controllers and `PICTURED`: those of the paper, and the best that know and that are
-# trained.
+# own controllers and `PICTURED`: those of the paper, a model-based and a trained controller.
 MOST_PICTURED = 8
 PICTURED = "nn", "pi", "dahlin", "ppo"
-LONGEST_LABEL = 16  # largest number of characters of a controller's label on the screen
 
 
 @dataclass(frozen=True)
@@ -79,15 +80,6 @@ class Comparison:
     runs: pd.DataFrame
     estimates: pd.DataFrame
     scores: Mapping[str, Estimate]
-
-    def label(self, agent: str) -> str:
-        """Return the name of a controller in tables."""
-        return self.controllers[agent].label
-
-    def travel(self, agent: str) -> str:
-        """Return the mean valve travel of a controller over all scenarios, t/h, as a text."""
-        runs = self.runs[self.runs["agent"] == agent]
-        return f"{runs.groupby('scenario')['total_variation'].mean().mean():,.0f}"
 
 
 def write(
@@ -148,26 +140,18 @@ def pictured(agents: Iterable[str]) -> list[str]:
 def sections(comparison: Comparison, note: str) -> list[Section]:
     """Return the sections of a comparison's report, with `note` in the first section."""
     scenarios = [scenario for scenario, _ in comparison.bounds]
-    shown = ", ".join(map(comparison.label, pictured(comparison.scores)))
-    about_cases = [CASES_TEXT, f"The pictures show these controllers: {shown}."]
-    if any("Figs" in scenario.title for scenario in scenarios):
-        about_cases.append("Figs are the figures of the paper by Cui and Shin (1992).")
+    table = score_table(comparison, format)
     return [
         Section(
-            "Score: 0 for an idle valve, 1 for the least possible error",
-            list(filter(None, [SCORE_TEXT, note])),
-            score_table(comparison),
+            "Score and error ratios",
+            [SCORE_TEXT, LEAST_TEXT, *filter(None, [note])],
+            pd.concat([least_table(comparison.bounds), table])[table.columns].fillna(""),
             pictures={"scores.png": "The score of each controller, and its score in each case"},
-        ),
-        Section(
-            "Error ratio: mean error / least possible error, with a 95 % confidence interval",
-            [RATIO_TEXT],
-            ratio_table(comparison),
         ),
         Section("What each controller knows and costs", [COSTS_TEXT], costs_table(comparison)),
         Section(
             "Cases",
-            about_cases,
+            [CASES_TEXT],
             cases_table(scenarios),
             pictures={
                 f"{scenario.name}.png": f"Temperature and flow over time: {scenario.title}"
@@ -177,43 +161,38 @@ def sections(comparison: Comparison, note: str) -> list[Section]:
     ]
 
 
-def score_table(comparison: Comparison) -> pd.DataFrame:
-    """Return a table of texts with the scores and the mean valve travel of each controller."""
-    means = comparison.estimates["scores"].map(lambda scores: as_text(scores.mean(), ".2f"))
-    table = table_by_agent(comparison, means)
-    scores = [f"{score:.3f}" for score in comparison.scores.values()]
-    table.insert(1, "score", scores)
-    table.insert(2, "travel (t/h)", [comparison.travel(agent) for agent in comparison.scores])
-    return table
+def score_table(comparison: Comparison, text: Callable[[Estimate, str], str]) -> pd.DataFrame:
+    """Return a table of texts with the score of each controller and its error ratios.
 
-
-def ratio_table(comparison: Comparison) -> pd.DataFrame:
-    """Return a table of texts with least possible errors and error ratios in each scenario.
-
-    The first row has the least possible errors, degC, and each further row has the error ratios
-    of one controller. The mark * follows a least possible error of the kind "reference", which
-    is the error for set-point changes that come as a surprise: controllers that have learnt the
-    times of the changes can have a smaller error.
+    `text` is a function that converts an estimate to a text in a format such as ".2f". The
+    controller with the highest score comes first.
     """
-    first_row = pd.DataFrame({"controller": ["least possible (°C)"]})
-    for scenario, least in comparison.bounds:
+    travels = comparison.runs.groupby(["agent", "scenario"])["total_variation"].mean()
+    rows = []
+    for agent, score in comparison.scores.items():
+        row = {"controller": comparison.controllers[agent].label, "score": text(score, ".3f")}
+        estimates = comparison.estimates[comparison.estimates["agent"] == agent]
+        for name, ratio in zip(estimates["scenario"], estimates["ratio"], strict=True):
+            row[name] = text(ratio, ".2f")
+        row["travel (t/h)"] = f"{travels[agent].mean():,.0f}"
+        rows.append(row)
+    names = [scenario.name for scenario, _ in comparison.bounds]
+    columns = ["controller", "score", *names, "travel (t/h)"]
+    return pd.DataFrame(rows, columns=columns).fillna("")
+
+
+def least_table(bounds: Sequence[Bound]) -> pd.DataFrame:
+    """Return a table of texts with one row, which has the least possible errors, degC.
+
+    The mark * follows a least possible error of the kind "reference", which is the error for
+    set-point changes that come as a surprise: controllers that have learnt the times of the
+    changes can have a smaller error.
+    """
+    row = {"controller": "least possible (°C)"}
+    for scenario, least in bounds:
         mark = "*" if least.kind == "reference" else ""
-        first_row[scenario.name] = [f"{least.value:.3f}{mark}"]
-    ratios = table_by_agent(comparison, comparison.estimates["ratio"].map("{:.2f}".format))
-    return pd.concat([first_row, ratios], ignore_index=True)
-
-
-def table_by_agent(comparison: Comparison, cells: Any) -> pd.DataFrame:
-    """Return a table of texts, with a row for each controller and a column for each scenario.
-
-    `cells` has a text for each row of `comparison.estimates`. The controller with the highest
-    score comes first.
-    """
-    rows = comparison.estimates.assign(cell=cells)
-    table = rows.pivot(index="agent", columns="scenario", values="cell")
-    table = table.loc[list(comparison.scores), rows["scenario"].unique()].fillna("")
-    table = table.rename(index=comparison.label)
-    return table.rename_axis(index="controller", columns=None).reset_index()
+        row[scenario.name] = f"{least.value:.3f}{mark}"
+    return pd.DataFrame([row])
 
 
 def costs_table(comparison: Comparison) -> pd.DataFrame:
@@ -256,26 +235,18 @@ def cases_table(scenarios: Sequence[Scenario]) -> pd.DataFrame:
 
 
 def on_screen(comparison: Comparison) -> str:
-    """Return the table of scores, error ratios and valve travel for a terminal of 80 columns.
+    """Return the table of scores and error ratios for a terminal of 80 columns.
 
     A heading of two words or more, such as "square zone 7", has its first word in the line
     above.
     """
-    headings = [case.heading or case.name for case, _ in comparison.bounds]
-    upper = []
-    lower = []
-    for heading in ("controller", "score", *headings, "travel (t/h)"):
-        first, _, others = heading.partition(" ")
-        upper.append(first if others else "")
-        lower.append(others or first)
-    rows = [upper, lower]
-    ratios = comparison.estimates.set_index(["agent", "scenario"])["ratio"]
-    for agent, score in comparison.scores.items():
-        row = [comparison.label(agent)[:LONGEST_LABEL], f"{score.value:.3f}"]
-        for scenario, _ in comparison.bounds:
-            ratio = ratios.get((agent, scenario.name))
-            row.append("" if ratio is None else f"{ratio.value:.2f}")
-        rows.append([*row, comparison.travel(agent)])
+    table = score_table(comparison, lambda estimate, form: as_text(estimate.value, form))
+    table["controller"] = table["controller"].str[:LONGEST_LABEL]
+    headings = {case.name: case.heading or case.name for case, _ in comparison.bounds}
+    words = [headings.get(name, name).partition(" ") for name in table.columns]
+    upper = [first if others else "" for first, _, others in words]
+    lower = [others or first for first, _, others in words]
+    rows = [upper, lower, *table.to_numpy().tolist()]
     first_width, *widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for label, *cells in rows:

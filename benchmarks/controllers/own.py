@@ -9,7 +9,7 @@ import inspect
 import json
 import pkgutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.command import CommandError
 from mptc_gym import Parameters
-from mptc_gym.rollout import start
 
 # The colours and markers that a user's own controllers get in turn.
 LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d")
@@ -111,7 +110,7 @@ def _direction(plant: Mapping[str, Any]) -> int:
 
 
 def from_factory(plant: KnownPlant, runs: int, seed: int, training: str) -> Any:
-    """Call a user's factory, and return the controller and the arguments of its environment.
+    """Call a user's factory, and return what it returns.
 
     Of `num_envs`, `seed`, `u_min`, `u_max` and `parameters` (all arguments of the environment),
     the factory gets those that are named in its signature. `training` is the location of the
@@ -120,26 +119,4 @@ def from_factory(plant: KnownPlant, runs: int, seed: int, training: str) -> Any:
     factory = pkgutil.resolve_name(training)
     offered = {"num_envs": runs, "seed": seed, "parameters": plant.parameters, **plant.limits}
     wanted = inspect.signature(factory).parameters
-    policy = factory(**{name: offered[name] for name in offered if name in wanted})
-    interface: Mapping[str, Any] = {}
-    if isinstance(policy, tuple):
-        policy, interface = policy
-    if not (hasattr(policy, "act") and hasattr(policy, "reset")):
-        policy = PolicyAgent(policy, runs)
-    return policy, interface
-
-
-@dataclass
-class PolicyAgent:
-    """A controller of `runs` runs that uses a policy in any form that `evaluate` accepts."""
-
-    policy: Any
-    runs: int
-
-    def reset(self) -> None:
-        """Prepare for a new episode."""
-        self._act = start(self.policy, self.runs)
-
-    def act(self, observation: Any) -> Any:
-        """Return the actions for an observation with a row for each run, shape (runs, 1)."""
-        return self._act(observation)
+    return factory(**{name: offered[name] for name in offered if name in wanted})

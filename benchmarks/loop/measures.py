@@ -14,6 +14,7 @@ from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.plant.dynamics import action_from_command, least_effective_command
 from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.rollout import rollout as run_batch
+from mptc_gym.rollout import start
 
 Array = NDArray[np.float64]
 
@@ -124,7 +125,7 @@ def is_random(parameters: Parameters) -> bool:
 
 def rollout(
     plants: Any,
-    agent: Agent,
+    agent: Any,
     samples: int,
     seed: int,
     before: Callable[[int], object] | None = None,
@@ -136,7 +137,8 @@ def rollout(
     plants
         Vector environment of the plants.
     agent
-        Controller, which acts at the samples k = 0 to `samples - 1`.
+        Controller, or a policy in another form that `mptc_gym.evaluate` takes, which acts at
+        the samples k = 0 to `samples - 1`.
     samples
         Length of a run, samples.
     seed
@@ -147,13 +149,13 @@ def rollout(
         for example to record the weights of a network.
     """
     clock = itertools.count()
+    act_of_agent = start(agent, plants.num_envs)
 
     def act(observations: Any) -> Any:
         if before:
             before(next(clock))
-        return agent.act(observations)
+        return act_of_agent(observations)
 
-    agent.reset()
     seeds = list(range(seed, seed + plants.num_envs))
     signals = []
     steps = run_batch(plants, act, samples, seeds)
@@ -284,11 +286,11 @@ def _measure_steps(setpoint: Array, output: Array) -> _StepMeasures:
     overshoot = 0.0
     settling_time = 0.0
     previous_setpoint = 0.0  # before k = 0
-    for start, stop in held(setpoint):
-        errors = setpoint[start:stop] - output[start:stop]
-        itae += float(np.arange(stop - start) @ np.abs(errors))
-        change = setpoint[start] - previous_setpoint
-        previous_setpoint = setpoint[start]
+    for first, stop in held(setpoint):
+        errors = setpoint[first:stop] - output[first:stop]
+        itae += float(np.arange(stop - first) @ np.abs(errors))
+        change = setpoint[first] - previous_setpoint
+        previous_setpoint = setpoint[first]
         if change == 0.0:  # The first set point is 0.
             continue
         overshoot = max(overshoot, float(np.max(-errors / change)))
@@ -296,7 +298,7 @@ def _measure_steps(setpoint: Array, output: Array) -> _StepMeasures:
         if len(outside) == 0:
             continue
         samples_outside = float(outside[-1] + 1)
-        if samples_outside == stop - start:  # The output has not settled at the end.
+        if samples_outside == stop - first:  # The output has not settled at the end.
             samples_outside = math.inf
         settling_time = max(settling_time, samples_outside)
     return _StepMeasures(itae, overshoot, settling_time)
