@@ -255,17 +255,22 @@ def test_an_invalid_range_of_times_is_refused_when_a_controller_is_made(name, li
 
 
 def test_a_set_point_that_may_soon_change_is_hedged():
-    plant = {"gain": -0.7, "time_constant": 160.0, "delay": 152.0}
-    flows_of_controllers = []
-    for holds in (None, (800.0, 2400.0)):  # s; 100 to 300 samples
-        controller = SelfTuningController(
-            **plant, dead_zone=0.0, setpoint_holds=holds, setpoint_amplitude=5.0
-        )
-        observation = np.array([4.0, 4.0, 4.0, 0.0, 0.0, 0.0])  # settled at the set point
-        flows = [controller.act(observation)[0] for _ in range(290)]
-        flows_of_controllers.append(np.array(flows))
-    without, hedged = flows_of_controllers
+    plant = {"gain": -0.7, "time_constant": 160.0, "delay": 152.0, "dead_zone": 0.0}
+
+    def hedge(setpoints):
+        """Return the difference in flow between a hedging controller and one that does not."""
+        flows = []
+        for holds in (None, (800.0, 2400.0)):  # s; 100 to 300 samples
+            controller = SelfTuningController(**plant, setpoint_holds=holds)
+            # The output has settled at the set point.
+            observations = [[level, 0.0, 0.0, 0.0] for level in setpoints]
+            flows.append([controller.act(row)[0] for row in observations])
+        return np.subtract(flows[1], flows[0])
+
+    constant = hedge([4.0] * 290)
     # The shortest hold time is 100 samples, and a flow affects the output after 20 samples.
-    assert np.abs(hedged - without)[:60].max() < 1e-6
+    assert np.abs(constant[:60]).max() < 1e-6
     # More flow lowers the temperature, towards the mean of the next set point.
-    assert (hedged - without)[240:].min() > 0.1
+    assert constant[240:].min() > 0.1
+    # The time until the next change begins anew with each set point.
+    assert np.abs(hedge(([4.0] * 70 + [3.9] * 70) * 2)).max() < 1e-6

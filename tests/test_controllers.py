@@ -95,14 +95,14 @@ def test_a_copy_in_mid_episode_goes_on_like_the_original(member, copied):
 
 
 @pytest.mark.parametrize(
-    ("name", "preset", "compensated"),
-    [("ppo", "dead-zone-7", 7.0), ("ppo", "hard", 5.0), ("ppo-hard", "paper", 0.0)],
+    ("name", "dead_zone", "compensated"),
+    [("ppo", 7.0, 7.0), ("ppo", [2.0, 4.0], 5.0), ("ppo-hard", 7.0, 0.0)],
 )
 def test_a_policy_acts_where_the_dead_zone_of_the_plant_is_compensated(
-    name, preset, compensated
+    name, dead_zone, compensated
 ):
-    # A range, as in `hard`, is not known before the run.
-    _, arguments = ROSTER[name].members()[0].start(PRESETS[preset], 1, 0)
+    # A dead zone that is drawn from a range is not known before the run.
+    _, arguments = ROSTER[name].members()[0].start({"dead_zone": dead_zone}, 1, 0)
     assert (arguments["action"], arguments["max_move"]) == ("change", 2.0)
     assert arguments["compensated_dead_zone"] == compensated
 
