@@ -178,11 +178,10 @@ class Panel:
         pixels. With `is_staircase`, each value holds until the next sample; otherwise, straight
         lines join the values.
         """
-        samples: Sequence[float] = range(self._first, self._record.k + 1)
+        points = list(map(self._point, range(self._first, self._record.k + 1), values))
         if is_staircase:
-            samples = np.repeat(samples, 2)[1:].tolist()
-            values = np.repeat(values, 2)[:-1].tolist()
-        points = list(map(self._point, samples, values))
+            doubled = np.repeat(points, 2, axis=0)
+            points = np.column_stack((doubled[1:, 0], doubled[:-1, 1])).tolist()
         if len(points) > 1:
             pygame.draw.lines(self._surface, colour, False, points, width)
 
@@ -212,7 +211,8 @@ class Panel:
 
 def frame(record: Record) -> NDArray[np.uint8]:
     """Return a picture of a record: uint8, shape (540, 960, 3), for rows, columns, RGB."""
-    surface = pygame.Surface(SIZE)
+    # The bytes of a pixel are in the order red, green, blue, as in the returned array.
+    surface = pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
     draw(surface, record)
     return np.array(pygame.surfarray.pixels3d(surface).swapaxes(0, 1), order="C")
 
