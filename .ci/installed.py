@@ -29,37 +29,19 @@ assert not brought_along, brought_along
 
 about = installed.metadata
 assert about["License-Expression"] == "MIT"
-assert about["Description-Content-Type"] == "text/markdown"
-readme = str(about.get_payload())
-assert "MiddlePoint-v0" in readme
 # The package has no pictures or pages; its README links to those at the repository, if known.
-links = re.findall(r"(!?)\[[^]]*\]\(([^)]*)\)", readme)
-relative = [target for _, target in links if not target.startswith("https:")]
-pictures = [target for picture, target in links if picture]
+pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", str(about.get_payload()))
 assert pictures
-urls = dict(url.split(", ", 1) for url in about.get_all("Project-URL", []))
-if "Repository" in urls:
-    assert not relative, relative
-    raw_files = urls["Repository"].rstrip("/") + "/raw/HEAD/"
-    assert all(picture.startswith(raw_files) for picture in pictures), pictures
-else:
-    assert relative
+if about.get_all("Project-URL"):
+    assert all("/raw/HEAD/" in picture for picture in pictures), pictures
 needed = [package for package in installed.requires or () if "extra ==" not in package]
-names = sorted(package.partition(">=")[0] for package in needed)
-assert names == ["gymnasium", "numpy"], needed
+assert sorted(package.partition(">=")[0] for package in needed) == ["gymnasium", "numpy"]
 
 env = gymnasium.make("mptc_gym:MiddlePoint-v0", noise_variance=0.5)
 check_env(env.unwrapped, skip_render_check=True)  # rendering needs an extra
-env.action_space.seed(0)
-env.reset(seed=0)
-for _ in range(1000):
-    env.step(env.action_space.sample())
-
 envs = gymnasium.make_vec("MiddlePoint-v0", num_envs=8, noise_variance=0.5)
-envs.action_space.seed(0)
 envs.reset(seed=0)
-for _ in range(1000):
-    envs.step(envs.action_space.sample())
+envs.step(envs.action_space.sample())
 
 import mptc_gym  # noqa: E402 (last, since the id above must do without it)
 

@@ -12,7 +12,6 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 
-from mptc_gym import evaluation
 from mptc_gym.plant.parameters import argument_table
 
 ROOT = Path(__file__).parent.parent
@@ -20,9 +19,6 @@ CONTRIBUTING = ".github/CONTRIBUTING.md"
 # Suffixes of the files that the site shows or offers as they are.
 SHOWN = {".csv", ".ipynb", ".json", ".md", ".png", ".txt", ".yml"}
 ARGUMENTS = markdown.markdown(argument_table(), extensions=["tables"])  # a table in HTML
-# Names of constants of `mptc_gym.evaluation` in a signature, in HTML.
-CONSTANT = re.compile(r'<span class="n">(SEED|EPISODES)</span>')
-PICTURE = re.compile(r'(<img [^>]*src="([^"]+)"[^>]*>)')
 # The end of a relative link to a source file, in Markdown.
 LINK_TO_SOURCE = re.compile(r"(\]\((?!https?:)[^)#]+\.py)\)")
 
@@ -56,12 +52,8 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """Return a page in HTML with what Markdown cannot say, such as links around pictures."""
+    """Return a page in HTML with what Markdown cannot say, such as the table of arguments."""
     html = html.replace("<p>::</p>\n", "")  # before literal blocks in docstrings
     # The environment's docstring gets the table of its arguments when it is imported.
     html = html.replace("<p><arguments></p>", ARGUMENTS)
-    # A value has groups of digits, as in 5_000_000.
-    html = CONSTANT.sub(lambda name: f"{getattr(evaluation, name[1]):_}", html)
-    html = html.replace('href="README.md"', 'href="../"')  # in the notebook
-    # On a small screen, a click shows the picture in full size.
-    return PICTURE.sub(r'<a href="\2">\1</a>', html)
+    return html.replace('href="README.md"', 'href="../"')  # in the notebook

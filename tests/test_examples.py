@@ -4,7 +4,6 @@ import json
 import re
 import runpy
 import sys
-from functools import partial
 from pathlib import Path
 
 import cyclopts
@@ -57,17 +56,6 @@ def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):
     model = PPO.load(tmp_path / "ppo-3.zip", env=plants, device="cpu")
     noisy = evaluate(model, "MiddlePointNoisy-v0")
     assert f"{noisy.mean_error:.3f}" == line[1]
-
-
-def test_stable_baselines3_learns_with_the_lines_of_the_page():
-    page = (ROOT / "benchmarks/examples/clients.md").read_text(encoding="utf-8")
-    lines = re.findall(r"^\| Stable-Baselines3.*?`(.+?)`", page, re.MULTILINE)
-    short = partial(PPO, device="cpu", n_steps=8, batch_size=8, n_epochs=1, seed=0)
-    names = {"PPO": short, "mptc_gym": mptc_gym, "gymnasium": gymnasium}
-    models = [eval(line, names) for line in lines]
-    assert [model.n_envs for model in models] == [1, 64]
-    for model in models:
-        assert model.learn(1).num_timesteps == 8 * model.n_envs
 
 
 def test_the_notebook_runs_and_shows_what_it_showed(capsys, monkeypatch):
