@@ -71,14 +71,17 @@ def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, caps
     # `.ci/versions` tests without the extras, where many examples cannot run.
     if "benchmarks" in names:
         names |= COMPARE
+    if "DataCollector" in example:
+        names.add("jax")  # which Minari needs for it
     for name in names - {"agents", "benchmarks"}:
         pytest.importorskip(name, reason=f"the example needs {name}, of an extra")
     monkeypatch.chdir(tmp_path)
     if "minari" in names:
-        from benchmarks.datasets import main  # as it needs Minari
+        from benchmarks.datasets import IDS, main  # as it needs Minari
 
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-        assert main([*re.findall(r"middlepoint/[\w/-]+", example), "--episodes", "2"]) == 0
+        for name in IDS.keys() & re.findall(r"middlepoint/[\w/-]+", example):
+            assert main([name, "--episodes", "2"]) == 0
     elif not printed:
         for spec in gymnasium.registry.values():
             if spec.id.startswith("MiddlePoint"):
