@@ -33,17 +33,6 @@ from mptc_gym.sb3 import GymnasiumVecEnv, ScoreCallback, make_vec_env
 HARD = "MiddlePointHard-v0"
 CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 5.0}
 TRAINING = {"action_window": 20, "setpoint": "random", "reward": "absolute"}
-SHORT = {"setpoint": "random", "setpoint_period": 20, "max_episode_steps": 30}
-# Numbers and arguments of the plants in two batches.
-TWO_KINDS = [(3, {"noise_variance": 0.5, **SHORT}), (1, SHORT)]
-
-
-def two_batches(mode="SameStep"):
-    batches = [
-        gymnasium.make_vec("MiddlePoint-v0", n, autoreset_mode=mode, **arguments)
-        for n, arguments in TWO_KINDS
-    ]
-    return GymnasiumVecEnv(*batches)
 
 
 def one(**arguments):
@@ -55,17 +44,12 @@ def model_of(plants, **arguments):
     return PPO("MlpPolicy", plants, **small, **arguments)
 
 
-class TestBatches:
-    @pytest.mark.parametrize("kind", ["changes", "two"])
-    def test_they_equal_dummy_vec_env(self, kind, rng):
-        if kind == "two":
-            batch = two_batches()
-            makers = [partial(one, **arguments) for n, arguments in TWO_KINDS for _ in range(n)]
-        else:
-            arguments = {**TRAINING, **CHANGE, "max_episode_steps": 7}
-            batch = make_vec_env(HARD, 4, **arguments)
-            makers = [partial(gymnasium.make, HARD, **arguments)] * 4
-        dummy = DummyVecEnv([lambda make=make: Monitor(make()) for make in makers])
+class TestBatch:
+    @pytest.mark.parametrize("form", [{}, CHANGE])
+    def test_it_equals_dummy_vec_env(self, form, rng):
+        arguments = {**TRAINING, **form, "max_episode_steps": 7}
+        batch = make_vec_env(HARD, 4, **arguments)
+        dummy = DummyVecEnv([lambda: Monitor(gymnasium.make(HARD, **arguments))] * 4)
         batch.seed(3)
         dummy.seed(3)
         for name in ("num_envs", "observation_space", "action_space"):
@@ -102,22 +86,17 @@ class TestBatches:
             plants.step(rng.normal(0, 1, (6, 1)))
             assert len(np.unique(plants.infos["noise"])) == 2
 
-    def test_attributes_and_pictures_are_those_of_the_batches(self):
-        pictured = make_vec_env("MiddlePoint-v0", 2, render_mode="rgb_array")
+    def test_attributes_and_pictures_are_those_of_the_batch(self):
+        pictured = make_vec_env("MiddlePoint-v0", 2, render_mode="rgb_array", delay=3)
         pictured.reset()
-        np.testing.assert_array_equal(pictured.get_images(), pictured.batches[0].render())
-        batch = two_batches()
-        batch.reset()
-        batch.step(np.ones((4, 1), np.float32))
-        assert list(batch.infos["command"]) == [10.0] * 4
-        assert list(batch.infos["noise"] != 0.0) == [True, True, True, False]
-        assert [p.noise_variance for p in batch.get_attr("parameters", [0, 3])] == [0.5, 0.0]
-        assert batch.env_is_wrapped(Monitor) == [False] * 4
-        for refuse in (batch.set_attr, batch.env_method):
-            with pytest.raises(NotImplementedError, match=r"use `batches`, .*parameters"):
+        np.testing.assert_array_equal(pictured.get_images(), pictured.batch.render())
+        assert [plant.delay for plant in pictured.get_attr("parameters", [1])] == [3]
+        assert pictured.env_is_wrapped(Monitor) == [False, False]
+        for refuse in (pictured.set_attr, pictured.env_method):
+            with pytest.raises(NotImplementedError, match=r"use `batch`, .*parameters"):
                 refuse("parameters", None)
         with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
-            two_batches("NextStep")
+            GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", 2))
 
     def test_bad_arguments_are_named(self):
         for error, message, arguments in [
