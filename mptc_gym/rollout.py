@@ -299,13 +299,13 @@ def _check_fit(policy: Any, plants: Plants, *, is_made_by_user: bool) -> None:
                 f"{', '.join(f'{name}={received[name]}' for name in differing)}"
             )
     if hasattr(policy, "get_env"):
-        expected_spaces = policy.observation_space, policy.action_space
-        spaces = plants.single_observation_space, plants.single_action_space
+        expected_spaces = policy.observation_space.shape, policy.action_space
+        spaces = plants.single_observation_space.shape, plants.single_action_space
         if spaces != expected_spaces:
             raise ValueError(
-                f"env must have the spaces of the policy's training, "
-                f"{shorten(expected_spaces)}, got {shorten(spaces)}: load the model with its "
-                "environments, PPO.load(path, env=...)"
+                f"env must have the observations and actions of the policy's training, "
+                f"{expected_spaces}, got {spaces}: load the model with its environments, "
+                "PPO.load(path, env=...)"
             )
 
 
