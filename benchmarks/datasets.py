@@ -61,8 +61,17 @@ class Options:
 
 def work(options: Options) -> None:
     """Write data sets, and print the mean errors of each data set."""
-    for dataset_id in dict.fromkeys(options.ids or IDS):  # without repeated ids
-        print(f"{dataset_id}: {write(dataset_id, options.episodes)}", flush=True)
+    import minari
+
+    ids = list(dict.fromkeys(options.ids or IDS))  # without repeated ids
+    existing = [dataset_id for dataset_id in ids if dataset_id in minari.list_local_datasets()]
+    if existing:
+        listed = " ".join(existing)
+        raise CommandError(f"data sets exist; to remove them: minari delete {listed}")
+    print("mean |e| (°C)                  data set  least possible  idle valve")
+    for dataset_id in ids:
+        errors = write(dataset_id, options.episodes)
+        print(f"{dataset_id:<31}{errors[0]:8.3f}{errors[1]:16.3f}{errors[2]:12.3f}", flush=True)
 
 
 def arguments_of(preset: str) -> dict[str, Any]:
@@ -121,16 +130,15 @@ def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> l
     ]
 
 
-def write(dataset_id: str, episodes: int) -> str:
-    """Record a data set, write it to Minari's folder, and return mean errors as text.
+def write(dataset_id: str, episodes: int) -> tuple[float, float, float]:
+    """Record a data set, write it to Minari's folder, and return mean errors, degC.
 
-    A CommandError is raised if Minari's folder has a data set with the same id.
+    The returned errors are those of the data set, the least possible error, and the error of an
+    idle valve.
     """
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    if dataset_id in minari.list_local_datasets():
-        raise CommandError(f"{dataset_id} exists; remove it with: minari delete {dataset_id}")
     preset, behaviour = IDS[dataset_id]
     arguments = arguments_of(preset)
     recorded = record(preset, behaviour, episodes)
@@ -179,10 +187,7 @@ def write(dataset_id: str, episodes: int) -> str:
     dataset.storage.update_episode_metadata(
         [{"controller": episode.controller} for episode in recorded]
     )
-    return (
-        f"mean |e| {mean_error:.3f} °C, least possible {idle.least_possible:.3f}, "
-        f"idle valve {idle.mean_error:.3f}"
-    )
+    return mean_error, idle.least_possible, idle.mean_error
 
 
 main = command("datasets", Options, work)

@@ -80,5 +80,5 @@ def test_a_published_set_is_recorded_again_bit_for_bit(plant):
 def test_a_set_that_exists_is_not_replaced(minari, refused):
     name = "middlepoint/paper/mixed-v1"
     assert main([name, "--episodes", "1"]) == 0  # fewer than there are controllers
-    assert f"{name} exists; remove it with: minari delete {name}" in refused(main, [name])
+    assert f"data sets exist; to remove them: minari delete {name}" in refused(main, [name])
     assert minari.load_dataset(name).total_episodes == 1
