@@ -153,10 +153,6 @@ class TestEveryController:
             controller.act(np.zeros((2, 6)))
         controller.reset()
         assert np.all(controller.command == 0.0)
-        controller.act(np.zeros((3, 6)))
-        controller.reset()
-        with pytest.raises(ValueError, match="observation must"):
-            controller.act(np.zeros((0, 6)))
 
     def test_plants_that_it_was_not_made_for_are_refused(self, make):
         controller = of_loops(make, 1)
@@ -172,9 +168,8 @@ def test_some_controllers_refuse_more_plants():
     PIController(error_index=0).check_environment(errors_alone, 5)
     with pytest.raises(ValueError, match="newest setpoint as element 0"):
         SelfTuningController(**STEP_TEST, error_index=0).check_environment(errors_alone, 5)
-    for loops in (None, 2):
-        with pytest.raises(ValueError, match="num_envs=3, one loop per episode"):
-            DirectNNController(num_envs=loops).check_environment(Parameters(), 3)
+    with pytest.raises(ValueError, match="num_envs=3, one loop per episode"):
+        DirectNNController(num_envs=2).check_environment(Parameters(), 3)
     network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
     another_dead_zone = network.interface | {"compensated_dead_zone": 7.0}
     network.check_environment(Parameters(**another_dead_zone), 5)
@@ -376,11 +371,6 @@ class TestPolicyNetwork:
         assert network.act([0.5]) == 0.5  # without memory, the batch size may change
         assert network.command == pytest.approx(0.5 * 0.3 * 6.0)
 
-    @pytest.mark.parametrize("size", [4, 6])
-    def test_an_observation_of_another_size_is_refused(self, size):
-        with pytest.raises(ValueError, match=r"^observation must .*5[ ,]"):
-            policy().act(np.zeros(size))
-
     def test_files_with_wrong_settings_are_refused(self, tmp_path):
         path = tmp_path / "policy.npz"
         policy().save(path)
@@ -426,7 +416,6 @@ def test_saved_files_are_loaded_and_damaged_files_are_refused(tmp_path, kind):
 def test_nothing_in_a_foreign_file_is_executed(tmp_path, capsys):
     harm = np.array(Harm(), dtype=object)
     np.savez(tmp_path / "object.npz", about=harm, W=harm)
-    np.save(tmp_path / "array.npy", np.zeros(3))
     (tmp_path / "pickle.npz").write_bytes(pickle.dumps(Harm()))
     for kind, saved in SAVED.items():
         for file in tmp_path.iterdir():
@@ -452,7 +441,7 @@ BAD = {
     partial(SmithPredictor, **TUNED): [("delay", -8.0), ("dead_zone", np.nan)],
     partial(SelfTuningController, **STEP_TEST): [
         ("delay_range", (0.0, np.inf)), ("delay_range", (160.0, 80.0)),
-        ("delay_range", ("a", 5.0)), ("delay_range", 5.0),
+        ("delay_range", ("a", 5.0)), ("delay_range", 5.0), ("setpoint_holds", (9.0, 3.0)),
     ],
     policy: [
         ("observation", {"window": 5}), ("observation", {"output_window": 5.0}),

@@ -60,12 +60,6 @@ def test_it_identifies_the_plant(delay, gain, time_constant, noise):
     assert estimates["time_constant"] == pytest.approx(constant, rel=0.25)
 
 
-def test_the_steady_state_of_the_model_is_that_of_the_step_test():
-    outputs = simulated(np.ones(300))
-    assert outputs[: DELAY + 1].tolist() == [0.0] * (DELAY + 1)
-    assert outputs[-1] == pytest.approx(1.0, abs=1e-6)
-
-
 def test_the_response_of_a_single_model_is_that_of_its_difference_equation(rng):
     bank = Bank(np.array([CONSTANT]), np.array([DELAY]), np.zeros((1, 1)), n=1)
     flows = rng.uniform(-1.0, 1.0, 80)
@@ -120,25 +114,6 @@ class TestOutputFilter:
         load = change**2 * (of_load @ weights) @ surprise
         assert kalman.load[0] == pytest.approx(load, abs=1e-9)
 
-    def test_the_most_likely_filter_distinguishes_a_steady_load_from_noise(self, rng):
-        noise = 0.2 * rng.normal(size=600)
-        calm = self.filtered(np.zeros(600), noise)
-        loaded = self.filtered(np.zeros(600), noise + 2.0 * (np.arange(600) > 300))
-        # The first filter expects the smallest changes of the load.
-        assert calm.weights[0, 0] > 0.4 > loaded.weights[0, 0]
-        assert loaded.load[0] == pytest.approx(2.0, abs=0.3)
-
-    def test_a_load_remains_in_the_forecast_and_noise_does_not(self):
-        pole, fading = np.array([self.POLE]), np.array([self.POLE**19])
-        steady = np.full(200, 0.7)
-        pulse = np.where(np.arange(200) == 199, 0.7, 0.0)
-        of_load, of_noise = (
-            self.filtered(np.zeros(200), outputs).forecast(pole, fading)[0]
-            for outputs in (steady, pulse)
-        )
-        assert 0.55 < of_load < 0.7
-        assert 0.0 < of_noise < 0.3
-
 
 class TestRandomSetpoint:
     SETPOINT = RandomSetpoint(shortest=100.0, longest=300.0, amplitude=5.0)
@@ -164,11 +139,6 @@ class TestRandomSetpoint:
                 np.array([setpoint]), np.array([held]), np.array([0.6])
             )
             assert target[0] == pytest.approx(best, abs=0.12)
-
-    def test_a_set_point_that_stays_is_not_hedged(self):
-        setpoints = np.array([5.0, -2.0, 0.0])
-        targets = self.SETPOINT.targets(setpoints, np.ones(3), np.full(3, 0.5))
-        np.testing.assert_array_equal(targets, setpoints)
 
 
 def test_reset_forgets_the_plant(observations):
@@ -245,13 +215,6 @@ class TestScales:
             for _ in range(4):
                 slow.act(rows)
                 np.testing.assert_allclose(slow.command, plain.command, atol=0.01)
-
-
-@pytest.mark.parametrize("name", ["delay_range", "setpoint_holds"])
-@pytest.mark.parametrize("limits", [(5.0,), (9.0, 3.0), (-1.0, 3.0), (0.0, np.nan), "soon"])
-def test_an_invalid_range_of_times_is_refused_when_a_controller_is_made(name, limits):
-    with pytest.raises(ValueError, match=f"{name} must be two finite numbers of at least 0"):
-        SelfTuningController(**KNOWN, **{name: limits})
 
 
 def test_a_set_point_that_may_soon_change_is_hedged():

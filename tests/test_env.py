@@ -226,11 +226,6 @@ def test_the_spec_of_a_batch_makes_its_plants_one_by_one_or_together(given, samp
     assert not np.any(truncations[:-1])
 
 
-def test_the_size_of_a_batch_is_no_argument_of_one_plant():
-    with pytest.raises(TypeError, match="unexpected keyword argument 'num_envs'"):
-        gymnasium.make("MiddlePoint-v0", num_envs=2)
-
-
 BAD_ACTIONS = [
     np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.zeros(0), None, "up", "0.3", b"0.3",
     np.str_("0.3"), np.bytes_(b"0.3"), np.array(["0.3"]), ["0.3"], np.array("0.3", object),
@@ -289,16 +284,6 @@ EVERYTHING = {
     "dead_zone": [3, 7], "setpoint": "random",
     "output_window": 2, "action_window": 2,
 }  # fmt: skip
-
-
-def test_plants_that_share_a_generator_differ_in_their_random_numbers():
-    generator = np.random.default_rng(5)
-    levels = set()
-    for _ in range(2):
-        env = MiddlePointEnv(setpoint="random")
-        env.np_random = generator
-        levels.add(env.reset()[1]["setpoint"])
-    assert len(levels) == 2
 
 
 def test_plant_numbers_of_a_seed_never_change():
