@@ -617,7 +617,7 @@ class MiddlePointTorchEnv(BatchEnv):
 
     def _compute_block(self) -> None:
         """Compute what the present step and the next steps return, up to an episode's end."""
-        # A plant may begin an episode after the last sample of a block.
+        # The rows after the next end of an episode would be dropped, and computed again.
         samples = max(1, min(self._most_samples, self._next_end - self._clock + 1))
         for change in self._changes:
             samples = min(samples, (change - self._clock - 1) % DRIFT_INTERVAL + 1)

@@ -25,8 +25,10 @@ from mptc_gym.torch_env import MiddlePointTorchEnv, make_vec  # noqa: E402
 from tests.conftest import MODES, random_actions, valid_arguments  # noqa: E402
 
 HARD = PRESETS["hard"]
-ALL_SHOWN = {"action_window": 4, "output_window": 2, "move_weight": 0.1}
-CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 5.0}
+SQUARE = {"setpoint": "square", "setpoint_period": 91, "temperature_span": 4.0}
+# Limits whose mean is not 0, so that the action of a plant at rest is not 0 either.
+ALL_SHOWN = {"action_window": 4, "output_window": 2, "move_weight": 0.1, "u_min": -12.0}
+CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 4.7}
 
 
 def make(num_envs=2, **arguments):
@@ -63,8 +65,9 @@ class Replayed(MiddlePointTorchEnv):
         return values.to(self.dtype)
 
     def _begin(self, mask):
-        self.episodes += torch.tensor(mask)
-        draws = [self.now(name) for name in self.parameters.ranges]
+        begins = torch.tensor(mask)
+        self.episodes += begins
+        draws = [torch.where(begins, self.now(name), 0.0) for name in self.parameters.ranges]
         with mock.patch.object(torch_env, "_uniform", side_effect=draws):
             return super()._begin(mask)
 
@@ -144,14 +147,14 @@ def test_it_equals_the_environment_in_numpy(
 
 # float32 has 24 bits. Errors of rounding grow with the slowest pole's time constant of some 20
 # samples, and temperatures are some 10 degC: 10 * 20 * 2^-24 = 1e-5.
-@pytest.mark.parametrize("form", [{}, CHANGE])
+@pytest.mark.parametrize("form", [{}, CHANGE | SQUARE])
 @pytest.mark.parametrize(
     ("dtype", "tolerances"), [(torch.float64, (6e-8, 1e-9)), (torch.float32, (1e-5, 1e-4))]
 )
 def test_it_equals_it_over_long_episodes_in_both_types(dtype, tolerances, form, rng):
     assert_equals_numpy(
         3, rng, 600, 0.002, tolerances, {"dtype": dtype},
-        max_episode_steps=400, autoreset_mode="SameStep", **ALL_SHOWN, **HARD, **form,
+        max_episode_steps=400, autoreset_mode="SameStep", **ALL_SHOWN, **(HARD | form),
     )  # fmt: skip
 
 
@@ -164,6 +167,15 @@ def test_a_command_on_the_edge_of_the_dead_zone_passes(rng, dtype):
     for actions in (exact, float32_action(commands, -10.0, 10.0, zones)):
         infos = env.step(torch.tensor(actions)[:, None])[-1]
         np.testing.assert_allclose(infos["applied"], commands, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_change_that_is_rounded_does_not_fall_into_the_compensated_dead_zone(dtype):
+    # In float32, the action 0.7 commands 6.9999999 t/h.
+    env = make(2, dtype=dtype, **CHANGE | {"dead_zone": 7.0, "compensated_dead_zone": 7.0})
+    env.reset()
+    infos = env.step(torch.tensor([[1e-9], [-1e-9]]))[-1]
+    np.testing.assert_allclose(infos["applied"], [7.0, -7.0], rtol=1e-6)
 
 
 def test_draws_have_the_distributions_of_numpy(rng):
@@ -201,7 +213,7 @@ def test_draws_have_the_distributions_of_numpy(rng):
 class TestGradients:
     @pytest.mark.parametrize("plant", [
         {"dead_zone": 0.0, "action_window": 2}, {"delay": [2, 4], "gain_factor": [0.5, 2]},
-        {**HARD, **ALL_SHOWN, "delay": 2, "dead_zone": 1.0, "u_min": -12.0},
+        {**HARD, **ALL_SHOWN, "delay": 2, "dead_zone": 1.0},
         {**HARD, **ALL_SHOWN, **CHANGE, "delay": 2, "dead_zone": 1.0, "max_move": 0.05},
     ])  # fmt: skip
     def test_it_is_that_of_differences_away_from_the_kinks(self, plant):
