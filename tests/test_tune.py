@@ -20,17 +20,17 @@ from mptc_gym import Parameters
 from tests.conftest import ROOT
 
 
-class TestScore:
-    def test_cases_are_met_by_no_comparison(self):
-        compared = [case.arguments for case in SCENARIOS.values()]
-        assert not any(case.arguments in compared for case in tune.CASES.values())
+def test_cases_are_met_by_no_comparison():
+    compared = [case.arguments for case in SCENARIOS.values()]
+    assert not any(case.arguments in compared for case in tune.CASES.values())
 
-    def test_no_control_pays_for_not_settling(self):
-        row = tune.score("pi", {}, 2, 0, {"kp": 0.0, "ki": 0.0})
-        assert row["constant"] == pytest.approx(4.8)  # all of the set point, all the time
-        assert row["learnt"] == pytest.approx(5.2)
-        assert row["not converged"] == 1.0
-        assert row["objective"] == pytest.approx(np.mean([row[c] for c in tune.CASES]) + 5.0)
+
+def test_no_control_pays_for_not_settling():
+    row = tune.score("pi", {}, 2, 0, {"kp": 0.0, "ki": 0.0})
+    assert row["constant"] == pytest.approx(4.8)  # all of the set point, all the time
+    assert row["learnt"] == pytest.approx(5.2)
+    assert row["not converged"] == 1.0
+    assert row["objective"] == pytest.approx(np.mean([row[c] for c in tune.CASES]) + 5.0)
 
 
 @pytest.fixture
@@ -50,48 +50,23 @@ def search(out, plant=""):
     return pd.read_csv(out / "trials.csv")
 
 
-def tables_of(page):
-    """Return the rows of each table on a page, with numbers as floats."""
-    tables = []
-    for text in re.findall(r"(?:^\|.*\n)+", page.read_text(), re.MULTILINE):
-        rows = [line.strip("|\n").split("|") for line in text.splitlines()[2:]]
-        tables.append([[number_or_text(cell.strip()) for cell in row] for row in rows])
-    return tables
+PLANT = {
+    "b": [0.0912, 0.00808], "setpoint_amplitude": 10.0, "dead_zone": 3.0, "u_max": 20.0,
+    "noise_variance": 1.0, "disturbance_amplitude": 2.0, "setpoint_period": 300,
+}  # fmt: skip
 
 
-def number_or_text(cell):
-    try:
-        return float(cell)
-    except ValueError:
-        return cell
-
-
-def final_objective(kp, ki):
-    gains = {"kp": kp, "ki": ki}
-    return tune.score("pi", {}, 3, tune.FINAL_FIRST_RUN, gains)["objective"]
-
-
-class TestOtherPlants:
-    PLANT = {  # noqa: RUF012
-        "b": [0.0912, 0.00808], "setpoint_amplitude": 10.0, "dead_zone": 3.0, "u_max": 20.0,
-        "noise_variance": 1.0, "disturbance_amplitude": 2.0, "setpoint_period": 300,
-    }  # fmt: skip
-
-    def test_a_search_on_the_paper_plant_is_the_one_of_before(self):
-        for name, case in tune.cases({}).items():
-            expected = Parameters(**tune.CASES[name].arguments)
-            assert (case.samples, case.first) == tune.CASES[name][:2]
-            assert Parameters(**case.arguments) == expected
-
-    def test_cases_scale_with_the_plant(self):
-        cases = tune.cases(self.PLANT)
-        learnt, quiet = (Parameters(**cases[name].arguments) for name in ("learnt", "constant"))
-        assert (learnt.setpoint_amplitude, learnt.setpoint_period) == (10.4, 280)
-        assert learnt.disturbance_amplitude == 2.0
-        assert (quiet.setpoint, quiet.noise_variance, quiet.is_disturbed) == (9.6, 0.0, False)
-        assert cases["learnt"].samples == 1120
-        assert cases["dead zone"].arguments["dead_zone"] == pytest.approx(3.9)
-        assert cases["noise"].arguments["noise_variance"] == pytest.approx(0.8)
+def test_cases_scale_with_the_plant():
+    for name, case in tune.cases({}).items():
+        assert Parameters(**case.arguments) == Parameters(**tune.CASES[name].arguments)
+    cases = tune.cases(PLANT)
+    learnt, quiet = (Parameters(**cases[name].arguments) for name in ("learnt", "constant"))
+    assert (learnt.setpoint_amplitude, learnt.setpoint_period) == (10.4, 280)
+    assert learnt.disturbance_amplitude == 2.0
+    assert (quiet.setpoint, quiet.noise_variance, quiet.is_disturbed) == (9.6, 0.0, False)
+    assert cases["learnt"].samples == 1120
+    assert cases["dead zone"].arguments["dead_zone"] == pytest.approx(3.9)
+    assert cases["noise"].arguments["noise_variance"] == pytest.approx(0.8)
 
 
 def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path):
@@ -118,15 +93,21 @@ class TestSearch:
         assert len(trials) == 6
         assert trials["kp"].between(*PI_SPANS["kp"]).all()
         assert "The best" in capsys.readouterr().out
-        (rows,) = tables_of(tmp_path / "search/report.md")
-        assert [row[0] for row in rows[:2]] == ["of the search"] * 2
-        assert [row[:3] for row in rows[2:]] == [
-            ["of PI (1992)", 2.2, 0.3], ["of PI (searched)", *SEARCHED_GAINS.values()],
+        table = tune.finals("pi", {}, ["kp", "ki"], trials)
+        assert [*table["gains"]] == [
+            *["of the search"] * 2, "of PI (1992)", "of PI (searched)",
         ]  # fmt: skip
-        for _, kp, ki, *_, objective, _ in rows:
-            assert objective == pytest.approx(final_objective(kp, ki), rel=1e-3)
-        for *_, in_search in rows[:2]:
-            assert np.isclose(trials["objective"], in_search, rtol=1e-3).any()
+        assert table.loc[2:, ["kp", "ki"]].to_numpy().tolist() == [
+            [2.2, 0.3], [*SEARCHED_GAINS.values()],
+        ]  # fmt: skip
+        for row in table.itertuples():
+            gains = {"kp": row.kp, "ki": row.ki}
+            new_runs = tune.score("pi", {}, 3, tune.FINAL_FIRST_RUN, gains)
+            assert row.objective == new_runs["objective"]
+        best_of_search = np.sort(trials["objective"])[:2]
+        assert np.sort(table["in the search"][:2]) == pytest.approx(best_of_search)
+        written = json.loads((tmp_path / "search/gains.json").read_text())["gains"]
+        assert written == table.loc[0, ["kp", "ki"]].to_dict()
 
     def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch):
         uninterrupted, score, calls = search(tmp_path / "whole"), tune.score, []
@@ -158,20 +139,15 @@ def test_the_pages_of_the_searches_name_the_gains_of_other_commands():
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("name", tune.PRESENT)
 def test_the_present_gains_are_those_of_the_controllers_themselves(name):
-    plant = KnownPlant(Parameters())
-    trials = pd.DataFrame([tune.score(name, {}, 2, 0, mid_gains(name, plant))])
-    gains = list(ROSTER[name].spans(plant))
-    table = tune.finals(name, {}, gains, trials).iloc[1:]
+    spans = ROSTER[name].spans(KnownPlant(Parameters()))
+    middle = {gain: sum(span) / 2 for gain, span in spans.items()}
+    trials = pd.DataFrame([tune.score(name, {}, 2, 0, middle)])
+    table = tune.finals(name, {}, list(spans), trials).iloc[1:]
     case = tune.cases({})["dead zone"]
     for other, median in zip(tune.PRESENT[name], table["dead zone"], strict=True):
         seed = tune.FINAL_FIRST_RUN + tune.SPACING_OF_CASES
         trajectory = ROSTER[other].run(case.arguments, case.samples, 3, seed)
         assert median == pytest.approx(np.median(tune.mean_error(trajectory)), rel=1e-12)
-
-
-def mid_gains(name, plant):
-    """Return gains in the middle of the intervals of a search."""
-    return {gain: sum(span) / 2 for gain, span in ROSTER[name].spans(plant).items()}
 
 
 @pytest.mark.parametrize(
@@ -181,5 +157,5 @@ def test_spans_scale_with_the_plant(name, gain, span):
     spans = ROSTER[name].spans
     assert spans(KnownPlant(Parameters())) == {"pi": PI_SPANS, "nn": NN_SPANS}[name]
     # Twice the gain, of the other sign: half the gains of a controller, likewise.
-    twice = KnownPlant(Parameters(**TestOtherPlants.PLANT))
+    twice = KnownPlant(Parameters(**PLANT))
     assert spans(twice)[gain] == pytest.approx(span)
