@@ -13,7 +13,7 @@ import torch
 from gymnasium import wrappers
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
-from sb3_contrib import TQC, RecurrentPPO
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
@@ -147,13 +147,6 @@ class Predicting(Integrator):
 
     def predict(self, observations, deterministic=False):
         return self.act(observations) + (0.0 if deterministic else 0.5), None
-
-
-class Forwarding:
-    """A policy that hands all keywords on, and returns actions alone."""
-
-    def predict(self, observations, **keywords):
-        return Predicting().predict(observations, keywords["deterministic"])[0]
 
 
 class Network(torch.nn.Module):
@@ -301,8 +294,8 @@ POLICIES = {
     "function": lambda: Case(law, lambda: law),
     "act and reset": lambda: Case(Integrator(), lambda: Integrator().act),
     "predict": lambda: Case(Predicting(), lambda: Integrator().act),
-    "predict with **keywords": lambda: Case(Forwarding(), lambda: lambda seen: Integrator().act(
-        seen)),
+    "predict of actions alone": lambda: Case(
+        SimpleNamespace(predict=law), lambda: law),  # as d3rlpy's
     "PI controller": lambda: Case(PIController(), lambda: PIController().act),
     "controller of many loops": of_batch,
     "module with act": lambda: Case(ActingNetwork(), lambda: ActingNetwork().act),
@@ -327,7 +320,6 @@ TRAININGS = {
     "Monitor": (lambda: dummy(lambda: Monitor(one())), one),
     "batch": (partial(batch, action_window=3), partial(one, action_window=3)),
     "changes": (partial(batch, **CHANGE), partial(one, **CHANGE)),
-    "changes of one": (partial(one, **CHANGE), partial(one, **CHANGE)),
     "processes": (processes, one),
     "VecNormalize": (lambda: trained(VecNormalize(batch())), one),
     "VecFrameStack": (lambda: VecFrameStack(dummy(), 2), stacked),
@@ -335,8 +327,9 @@ TRAININGS = {
     "wrappers": (stacked, stacked),
     "normalised rewards": (lambda: VecNormalize(dummy(), norm_obs=False), one),
 }
-MODELS = [*((PPO, name) for name in TRAININGS), (SAC, "batch"), (TQC, "VecNormalize"),
-          (RecurrentPPO, "VecNormalize")]  # fmt: skip
+MODELS = [
+    *((PPO, name) for name in TRAININGS), (SAC, "batch"), (RecurrentPPO, "VecNormalize"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("algorithm", "name"), MODELS)
@@ -346,9 +339,6 @@ def test_a_model_finds_the_interface_of_its_training(algorithm, name):
     with closing(model.get_env()):
         evaluation = evaluate(model, NOISY, episodes=EPISODES, **SHORT)
         assert_as_in_a_plain_loop(evaluation, lambda: act_of_model(model), make)
-        hard = evaluate(model, "MiddlePointHard-v0", episodes=EPISODES)
-        assert hard.env == "MiddlePointHard-v0"
-        assert evaluate(model, episodes=2).env == "MiddlePoint-v0"
 
 
 def test_frames_are_stacked_in_the_order_of_the_training():
@@ -518,8 +508,3 @@ def test_an_episode_has_at_most_1200_samples():
         assert evaluate(law, plants, episodes=2).score is not None
     for limit in (-1, 2000):
         assert evaluate(law, episodes=2, max_episode_steps=limit).score is not None
-
-
-def test_other_libraries_return_actions_alone():
-    policy = SimpleNamespace(predict=lambda seen: -0.1 * seen[:, 3:4])  # as d3rlpy's do
-    assert evaluate(policy, NOISY, episodes=2).travel > 1.0

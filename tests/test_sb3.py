@@ -2,7 +2,6 @@
 
 import csv
 from contextlib import closing
-from functools import partial
 
 import gymnasium
 import numpy as np
@@ -11,7 +10,6 @@ import torch
 from gymnasium.error import Error
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.wrappers import FlattenObservation
-from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
@@ -64,15 +62,13 @@ class TestBatch:
                 for array, expected in zip(arrays, expected_arrays, strict=True):
                     np.testing.assert_array_equal(array, expected)
                     assert array.dtype == expected.dtype
-                ended = arrays[2]
-                assert [bool(info) for info in infos] == ended.tolist()
-                for i in np.flatnonzero(ended):
+                for i in np.flatnonzero(arrays[2]):
                     episode = infos[i].pop("episode")
                     expected = expected_infos[i].pop("episode")
                     assert episode["r"] == pytest.approx(expected["r"], abs=2e-6)
                     assert episode["l"] == expected["l"]
                     assert data_equivalence(infos[i], expected_infos[i], exact=True)
-                ends += ended.sum()
+                    ends += 1
                 assert batch.reset_infos == dummy.reset_infos
         assert ends >= 16
 
@@ -92,9 +88,6 @@ class TestBatch:
         np.testing.assert_array_equal(pictured.get_images(), pictured.batch.render())
         assert [plant.delay for plant in pictured.get_attr("parameters", [1])] == [3]
         assert pictured.env_is_wrapped(Monitor) == [False, False]
-        for refuse in (pictured.set_attr, pictured.env_method):
-            with pytest.raises(NotImplementedError, match=r"use `batch`, .*parameters"):
-                refuse("parameters", None)
         with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
             GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", 2))
 
@@ -127,7 +120,6 @@ class Weights(BaseCallback):
 
 # The environments of a training, in all kinds of wrappers.
 TRAININGS = {
-    "DummyVecEnv": lambda: DummyVecEnv([partial(gymnasium.make, HARD)] * 2),
     "SubprocVecEnv": lambda: SubprocVecEnv(
         [lambda: Monitor(gymnasium.make(HARD))] * 2, start_method="fork"),
     "make_vec_env": lambda: make_vec_env(HARD, 2, seed=0, group=2, max_episode_steps=20),
@@ -136,21 +128,21 @@ TRAININGS = {
     "wrapper": lambda: DummyVecEnv([lambda: FlattenObservation(gymnasium.make(HARD))] * 2),
 }  # fmt: skip
 ALGORITHMS = {
-    PPO: ("MlpPolicy", {"n_steps": 16, "batch_size": 16, "n_epochs": 1}),
-    SAC: ("MlpPolicy", {"learning_starts": 8, "batch_size": 8, "train_freq": 8}),
-    RecurrentPPO: ("MlpLstmPolicy", {"n_steps": 16, "batch_size": 16, "n_epochs": 1}),
+    PPO: {"n_steps": 16, "batch_size": 16, "n_epochs": 1},
+    SAC: {"learning_starts": 8, "batch_size": 8, "train_freq": 8},
 }
 
 
 class TestScoreCallback:
-    @pytest.mark.parametrize("algorithm", ALGORITHMS)
-    @pytest.mark.parametrize("kind", TRAININGS)
-    def test_a_training_is_the_same_with_scores_and_without(self, kind, algorithm, tmp_path):
-        policy, settings = ALGORITHMS[algorithm]
+    @pytest.mark.parametrize(
+        ("algorithm", "kind"), [*((PPO, kind) for kind in TRAININGS), (SAC, "make_vec_env")]
+    )
+    def test_a_training_is_the_same_with_scores_and_without(self, algorithm, kind, tmp_path):
         trainings = []
         for scores in (True, False):
             with closing(TRAININGS[kind]()) as plants:
-                model = algorithm(policy, plants, seed=0, device="cpu", **settings)
+                settings = ALGORITHMS[algorithm]
+                model = algorithm("MlpPolicy", plants, seed=0, device="cpu", **settings)
                 weights = Weights()
                 callback = ScoreCallback(
                     HARD, every=20, episodes=2, folder=tmp_path, verbose=0, max_episode_steps=9
