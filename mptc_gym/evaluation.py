@@ -14,20 +14,18 @@ from numpy.typing import NDArray
 
 from mptc_gym.plant.checks import count
 from mptc_gym.plant.dynamics import action_from_command
-from mptc_gym.plant.parameters import ARGUMENTS, Parameters
+from mptc_gym.plant.parameters import ARGUMENTS, INTERFACE, Parameters
 from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.rollout import (
-    INTERFACE,
     Plants,
     Sample,
     layers,
     opened,
-    parameters_of,
     replayed,
     rollout,
     start,
 )
-from mptc_gym.vector_env import MiddlePointVectorEnv
+from mptc_gym.vector_env import MiddlePointVectorEnv, parameters_of
 
 Values = NDArray[np.float64]  # one number for each episode, shape (episodes,)
 

@@ -16,12 +16,9 @@ from numpy.typing import NDArray
 
 from mptc_gym.plant.checks import reject, shorten
 from mptc_gym.plant.dynamics import action_from_command
-from mptc_gym.plant.parameters import Parameters
-from mptc_gym.vector_env import MiddlePointVectorEnv
+from mptc_gym.plant.parameters import INTERFACE, Parameters
+from mptc_gym.vector_env import MiddlePointVectorEnv, parameters_of
 
-WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
-# The arguments of an environment that say what a policy observes and what its actions mean.
-INTERFACE: Final = *WINDOWS, "action", "max_move", "compensated_dead_zone"
 # Largest difference between an info and the expected info, divided by (1 + |expected info|):
 # far more than rounding errors, and far less than the effect of another plant or seed.
 _TOLERANCE: Final = 1e-6
@@ -183,7 +180,7 @@ def _make_plants(policy: Any, env: Any, n: int, arguments: Mapping[str, Any]) ->
     """Return a new vector environment; the docstring of `opened` describes the arguments."""
     if isinstance(env, str | EnvSpec):
         if training_of(policy) is not None:
-            from mptc_gym.sb3 import like  # which needs Stable-Baselines3
+            from mptc_gym.sb3_vec_env import like  # which needs Stable-Baselines3
 
             return _FromVecEnv(like(policy, env, n, **arguments))
         if isinstance(env, EnvSpec) and env.additional_wrappers:
@@ -320,22 +317,6 @@ def _interface(env: Any) -> dict[str, Any]:
     interface = {name: getattr(parameters, name) for name in INTERFACE}
     interface["normalised"] = any("obs_rms" in vars(layer) for layer in layers(env))
     return interface
-
-
-def parameters_of(env: Any) -> Parameters:
-    """Return the arguments of the first plant in a vector environment or a `VecEnv`.
-
-    A ValueError is raised if `env` is not of this package, or is in PyTorch.
-    """
-    if isinstance(env.unwrapped, MiddlePointVectorEnv):
-        return env.unwrapped.parameters
-    try:
-        parameters = env.get_attr("parameters")[0]
-    except AttributeError:
-        parameters = None
-    if not isinstance(parameters, Parameters):
-        reject("env", env, "of mptc_gym and in NumPy, such as an id or a spec of it")
-    return parameters
 
 
 def replayed(

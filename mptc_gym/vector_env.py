@@ -17,7 +17,7 @@ from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.env import EPISODE_STEPS, INFO, NO_RENDER_MODE, Frame, MiddlePointEnv
 from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_python
 from mptc_gym.plant.dynamics import PlantBatch, WantedFlows, action_from_command
-from mptc_gym.plant.parameters import full_signature
+from mptc_gym.plant.parameters import Parameters, full_signature
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
 
@@ -315,6 +315,22 @@ def make_vector_env(
     if max_episode_steps is None:
         max_episode_steps = EPISODE_STEPS
     return MiddlePointVectorEnv(num_envs, max_episode_steps=max_episode_steps, **arguments)
+
+
+def parameters_of(env: Any) -> Parameters:
+    """Return the arguments of the first plant in a vector environment or a `VecEnv`.
+
+    A ValueError is raised if `env` is not of this package, or is in PyTorch.
+    """
+    if isinstance(env.unwrapped, MiddlePointVectorEnv):
+        return env.unwrapped.parameters
+    try:
+        parameters = env.get_attr("parameters")[0]
+    except AttributeError:
+        parameters = None
+    if not isinstance(parameters, Parameters):
+        reject("env", env, "of mptc_gym and in NumPy, such as an id or a spec of it")
+    return parameters
 
 
 class _Window:

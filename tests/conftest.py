@@ -20,8 +20,7 @@ from hypothesis import strategies as st
 from benchmarks.loop.measures import Trajectory
 from mptc_gym import MiddlePointVectorEnv
 from mptc_gym.plant import checks
-from mptc_gym.plant.parameters import ARGUMENTS, CAN_BE_RANGES
-from mptc_gym.rollout import WINDOWS
+from mptc_gym.plant.parameters import ARGUMENTS, CAN_BE_RANGES, WINDOWS
 
 ROOT = Path(__file__).parent.parent
 if not os.access(ROOT, os.W_OK):

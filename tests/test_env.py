@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv, Parameters
-from mptc_gym.plant.parameters import PLANT_NUMBERS, argument_table
-from mptc_gym.rollout import WINDOWS
+from mptc_gym.plant.parameters import PLANT_NUMBERS, WINDOWS, argument_table
 from tests.conftest import ROOT, run, valid_arguments
 
 INFO = {"output", "setpoint", "error", "command", "applied", "noise"}

@@ -15,6 +15,9 @@ import numpy as np
 from mptc_gym.plant import checks
 from mptc_gym.plant.checks import Number, reject
 
+WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
+# The arguments of an environment that say what a policy observes and what its actions mean.
+INTERFACE: Final = *WINDOWS, "action", "max_move", "compensated_dead_zone"
 Value = TypeVar("Value")  # type of a `PlantNumbers` field: float, array, tensor or `Number`
 _LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
