@@ -6,7 +6,6 @@ import runpy
 import sys
 from pathlib import Path
 
-import cyclopts
 import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
@@ -25,11 +24,8 @@ from tests.conftest import ROOT
 def test_a_recurrent_policy_learns_and_enters_the_comparison(tmp_path, monkeypatch):
     monkeypatch.setattr(recurrent, "FILE", tmp_path / "recurrent.pt")
     monkeypatch.setattr(recurrent, "SEGMENT", 40)
-    network = recurrent.train(steps=2, plants=4)
-    torch.manual_seed(0)
-    untrained = recurrent.Recurrent()
-    trained = network.state_dict()
-    assert not torch.equal(trained["cell.weight_hh"], untrained.state_dict()["cell.weight_hh"])
+    untrained, trained = (recurrent.train(n, plants=4).state_dict() for n in (0, 2))
+    assert not torch.equal(trained["cell.weight_hh"], untrained["cell.weight_hh"])
     torch.save(trained, recurrent.FILE)
     # It remembers, and forgets at a reset.
     policy, observations = recurrent.make(), torch.randn(3, 6).numpy()
@@ -48,10 +44,10 @@ def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(gymnasium.spec(name), "max_episode_steps", 60)
     words = ["page", "--steps", "1", "--seed", "3", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", words)
-    runpy.run_path(str(ROOT / "benchmarks/examples/sb3.py"), run_name="__main__")
+    example = str(ROOT / "benchmarks/examples/sb3.py")
+    namespace = runpy.run_path(example, run_name="__main__")
     printed = capsys.readouterr().out
     line = re.search(r"MiddlePointNoisy-v0: mean error ([\d.]+)", printed)
-    namespace = runpy.run_path(str(ROOT / "benchmarks/examples/sb3.py"))
     plants = mptc_gym.sb3.make_vec_env("MiddlePoint-v0", 8, **namespace["PLANTS"])
     model = PPO.load(tmp_path / "ppo-3.zip", env=plants, device="cpu")
     noisy = evaluate(model, "MiddlePointNoisy-v0")
@@ -97,8 +93,8 @@ def test_a_bump_test_gives_the_plant_that_made_it(flow_before, tmp_path, monkeyp
     env.reset()
     outputs = [env.step(np.float32([1.0]))[4]["output"] for _ in range(200)]
     assert plant["delay"] == 2
-    assert [plant[name] for name in ("dead_zone", "u_min", "u_max")] == [1.5, -20.0, 30.0]
-    assert plant["sampling_interval"] == 4.0
+    numbers = {"dead_zone": 1.5, "u_min": -20.0, "u_max": 30.0, "sampling_interval": 4.0}
+    assert numbers.items() <= plant.items()
     assert outputs[-1] == pytest.approx(0.4 * 30.0, rel=0.01)
     assert outputs[9] == pytest.approx(0.4 * 30.0 * (1.0 - np.exp(-0.8)), rel=0.02)
     assert re.search(r"flow 0 (59\.9\d|60(\.0\d?)?) degC", capsys.readouterr().out)
@@ -120,15 +116,3 @@ def test_a_log_that_cannot_be_fitted_is_refused(change, message, tmp_path, monke
     change(bump_test()).to_csv("log.csv")
     with pytest.raises(SystemExit, match=message):
         fit_plant.main(Path("log.csv"), dead_zone=1.5, u_min=-20.0, u_max=30.0)
-
-
-@pytest.mark.parametrize("missing", ["dead-zone", "u-min", "u-max"])
-def test_a_fit_asks_for_dead_zone_and_limits(missing, capsys):
-    numbers = {"dead-zone": 1.5, "u-min": -20.0, "u-max": 30.0}
-    del numbers[missing]
-    words = [f"--{name}={number}" for name, number in numbers.items()]
-    app = cyclopts.App()
-    app.default(fit_plant.main)
-    with pytest.raises(SystemExit):
-        app([__file__, *words])
-    assert f"--{missing} requires an argument" in capsys.readouterr().err
