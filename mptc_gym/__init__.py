@@ -18,7 +18,7 @@ from mptc_gym.plant.parameters import Parameters
 from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
-__version__ = "0.6.0"
+__version__ = "0.7.0"
 __all__ = [
     "IDS",
     "PRESETS",
