@@ -320,22 +320,22 @@ def _interface(env: Any) -> dict[str, Any]:
 
 
 def replayed(
-    samples: Iterator[Sample], parameters: Parameters, seeds: Sequence[int]
+    samples: Iterator[Sample], case: Parameters, seeds: Sequence[int]
 ) -> Iterator[Sample]:
     """Yield the samples of a rollout, and compare each sample with a second simulation.
 
-    The second simulation is a `MiddlePointVectorEnv` with the arguments, the seeds and the
-    commanded flows of the rollout. A ValueError is raised if infos of the rollout differ from
-    infos of the second simulation: the environment of the rollout then has changed the seed,
-    skipped samples, or changed the plant or the infos.
+    The second simulation is a `MiddlePointVectorEnv` with the seeds of the rollout and the
+    arguments `case`, whose actions set flows: the flows that the rollout commanded. A
+    ValueError is raised if infos of the rollout differ from infos of the second simulation: the
+    environment of the rollout then has changed the seed, skipped samples, or changed the plant
+    or the infos.
     """
-    plants = MiddlePointVectorEnv(len(seeds), **(asdict(parameters) | {"action": "flow"}))
-    limits = parameters.u_min, parameters.u_max
+    plants = MiddlePointVectorEnv(len(seeds), **asdict(case))
     _, expected = plants.reset(seed=[*seeds])
     for k, sample in enumerate(samples):
         if k > 0:
-            commands = np.asarray(sample.infos.get("command", np.zeros(len(seeds))))
-            actions = action_from_command(commands, *limits)
+            commands = sample.infos.get("command", np.zeros(len(seeds)))
+            actions = action_from_command(commands, case.u_min, case.u_max)
             expected = plants.step(np.reshape(actions, (-1, 1)))[-1]
         _compare_infos(sample.infos, expected, k)
         yield sample
