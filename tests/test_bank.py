@@ -8,8 +8,6 @@ from agents.bank import (
     FAST_POLE,
     GAIN_SPREAD,
     NOISE_COLOUR,
-    Bank,
-    model_coefficients,
 )
 from agents.hedge import RandomSetpoint
 from agents.output_filter import LOAD_MEMORY, READING_SHARE, OutputFilter
@@ -18,7 +16,6 @@ from tests.conftest import STEP_TEST
 
 KNOWN = {**STEP_TEST, "dead_zone": 5.0}
 GAIN, TIME_CONSTANT = -0.6825, 161.0  # of the paper's plant, degC per t/h and s
-DELAY, CONSTANT = 5, 12.0  # samples
 
 
 @pytest.fixture
@@ -28,18 +25,6 @@ def observations(rng):
     errors = 0.3 * setpoints + 0.1 * np.cumsum(rng.normal(size=(120, 3)), axis=0)
     zeros = np.zeros_like(errors)
     return np.stack([setpoints, zeros, zeros, errors], axis=2)
-
-
-def simulated(flows):
-    """Return the outputs of a model of gain 1 by its difference equation."""
-    a1, a2, newer, older = model_coefficients(np.array(CONSTANT))
-    outputs = np.zeros(len(flows))
-    for k in range(1, len(flows)):
-        newest, before = (flows[i] if i >= 0 else 0.0 for i in (k - DELAY - 1, k - DELAY - 2))
-        outputs[k] = a1 * outputs[k - 1] + newer * newest + older * before
-        if k >= 2:
-            outputs[k] += a2 * outputs[k - 2]
-    return outputs
 
 
 @pytest.mark.parametrize(
@@ -58,16 +43,6 @@ def test_it_identifies_the_plant(delay, gain, time_constant, noise):
     assert estimates["gain"] == pytest.approx(np.full(2, GAIN * gain), rel=0.1)
     constant = np.full(2, TIME_CONSTANT * time_constant)
     assert estimates["time_constant"] == pytest.approx(constant, rel=0.25)
-
-
-def test_the_response_of_a_single_model_is_that_of_its_difference_equation(rng):
-    bank = Bank(np.array([CONSTANT]), np.array([DELAY]), np.zeros((1, 1)), n=1)
-    flows = rng.uniform(-1.0, 1.0, 80)
-    expected = simulated(flows)
-    for k, flow in enumerate(flows):
-        bank.observe(np.array([expected[k]], np.float32))
-        bank.apply(np.array([flow], np.float32))
-    assert bank.responses[:, 0] == pytest.approx(expected[[-1, -2]], abs=1e-5)
 
 
 class TestOutputFilter:
@@ -139,15 +114,6 @@ class TestRandomSetpoint:
                 np.array([setpoint]), np.array([held]), np.array([0.6])
             )
             assert target[0] == pytest.approx(best, abs=0.12)
-
-
-def test_reset_forgets_the_plant(observations):
-    controller = SelfTuningController(**KNOWN)
-    first = [controller.act(rows) for rows in observations]
-    controller.reset()
-    assert controller.estimates == {}
-    again = [controller.act(rows) for rows in observations]
-    np.testing.assert_array_equal(first, again)
 
 
 @pytest.mark.parametrize("dead_zone", [5.0, 7.0])

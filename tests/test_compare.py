@@ -233,23 +233,6 @@ class TestCompare:
         assert "**Unfinished: 2 of 4 tasks are missing.**" in (out / "report.md").read_text()
 
     @pytest.mark.usefixtures("undrawn")
-    def test_cases_not_finished_are_left_out_and_one_run_has_no_interval(
-        self, compared, monkeypatch
-    ):
-        def with_a_fault(scenario, *given):
-            if scenario.name == "square":
-                raise ArithmeticError("a fault")
-            return run_case(scenario, *given)
-
-        monkeypatch.setattr(runs, "run_case", with_a_fault)
-        out = compared("--agents pi nn --scenarios square constant --runs 1", status=1)
-        estimates = pd.read_csv(out / "estimates.csv").set_index("agent")
-        assert estimates["scenario"].tolist() == ["constant"] * 2
-        assert "| PI (1992)" in (out / "report.md").read_text()
-        assert estimates.loc["nn", ["mean_low", "mean_high"]].isna().all()  # weights are drawn
-        assert estimates.loc["pi", "mean_low"] == estimates.loc["pi", "mean_high"]
-
-    @pytest.mark.usefixtures("undrawn")
     def test_a_seed_is_that_of_the_runs_and_of_their_bounds(self, compared):
         given = "--presets --agents smith --scenarios randomised --runs 2"
         published = least_possible(samples=1200, episodes=2, **PRESETS["randomised"])

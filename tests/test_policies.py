@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import wrappers
-from gymnasium.spaces import Discrete
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from sb3_contrib import RecurrentPPO
-from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -73,15 +72,6 @@ def trained(normaliser):
     statistics.var = statistics.mean + 2.0
     statistics.count = 1000
     return normaliser
-
-
-def discrete():
-    """Return an environment whose action chooses one of five flows."""
-
-    def action_of(choice):
-        return np.array([choice / 2.0 - 1.0], np.float32)
-
-    return wrappers.TransformAction(one(), action_of, Discrete(5))
 
 
 def stacked():
@@ -351,12 +341,6 @@ def test_frames_are_stacked_in_the_order_of_the_training():
     evaluation = evaluate(model, lambda: VecFrameStack(made(), 2), episodes=EPISODES)
     again = evaluate(model, NOISY, episodes=EPISODES, **SHORT)
     np.testing.assert_array_equal(evaluation.errors, again.errors)
-
-
-def test_discrete_actions_are_those_of_the_training():
-    model = model_of(discrete(), DQN)
-    evaluation = evaluate(model, NOISY, episodes=EPISODES, **SHORT)
-    assert_as_in_a_plain_loop(evaluation, lambda: act_of_model(model), discrete)
 
 
 def test_a_model_from_a_file_acts_where_it_is_loaded(tmp_path):

@@ -1,6 +1,5 @@
 """Every seed of the project is one of the table, and no two purposes share one."""
 
-import ast
 import itertools
 import json
 import re
@@ -17,7 +16,6 @@ from benchmarks.train import __main__ as train
 from mptc_gym import evaluation
 from tests.conftest import ROOT
 
-TABLE = ROOT / "benchmarks/lib/seeds.py"
 PAGES = [ROOT / "README.md", *ROOT.glob("*/**/*.md")]
 
 
@@ -53,21 +51,6 @@ def test_policies_are_chosen_and_trained_where_nothing_is_published():
     ppo = pytest.importorskip("benchmarks.train.ppo", reason="PPO needs an extra")
     assert block_of(ppo.VALIDATION_SEED + evaluation.EPISODES - 1) == "validation"
     assert block_of(ppo.TRAINING_SEEDS + (1 << 32) - 1) == "training"
-
-
-def test_no_other_file_has_a_first_seed_of_its_own():
-    elsewhere = {*ROOT.glob("*/**/*.py")} - {TABLE, ROOT / "mptc_gym/evaluation.py"}
-    for path in elsewhere:
-        if path.relative_to(ROOT).parts[0] not in ("agents", "benchmarks", "mptc_gym"):
-            continue
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Assign) and re.search(
-                "SEED|RUN", ast.unparse(node.targets)
-            ):
-                values = [
-                    leaf.value for leaf in ast.walk(node) if isinstance(leaf, ast.Constant)
-                ]
-                assert not [n for n in values if isinstance(n, int) and n >= 10_000], path
 
 
 def test_pages_name_seeds_of_the_table():
