@@ -12,8 +12,14 @@ page = PAGE.read_text(encoding="utf-8")
 # The heading of a library is "## TITLE (`NAME` VERSION)".
 _, section = re.split(rf"^## .*\(`{name}` .*\)$", page, flags=re.MULTILINE)
 section, *_ = section.split("\n## ")
-for _, *words in map(str.split, re.findall(r"^    (python -m .*)", section, re.MULTILINE)):
-    subprocess.run([sys.executable, *words], check=True)
+commands = re.findall(r"^    python (-m .*)", section, re.MULTILINE)
+if name == "rl_zoo3":  # the first line of a file is the command of the file
+    for file in PAGE.parent.glob("rl_zoo/*.yml"):
+        line = file.read_text(encoding="utf-8").splitlines()[0]
+        line = line.removeprefix("# python ").replace(file.name, str(file))
+        commands.append(f"{line} -n 9999")
+for command in commands:
+    subprocess.run([sys.executable, *command.split()], check=True)
 for code in re.findall(r"```python\n(.*?)```", section, re.DOTALL):
     exec(code, {})
 print(f"{name}: the code of the page runs")
