@@ -3,13 +3,6 @@
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
-from gymnasium.utils.env_checker import data_equivalence
-
-from mptc_gym import PRESETS
-
-CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 5.0}
-DRAWN = {**PRESETS["hard"], "action_window": 4, "move_weight": 0.1, **CHANGE}
 
 
 def make(**arguments):
@@ -68,42 +61,3 @@ def test_the_cost_of_a_move_is_that_of_the_commanded_flow():
         env.reset()
         rewards.append(env.step(np.ones(1, np.float32))[1])
     assert rewards[0] - rewards[1] == pytest.approx(0.4)
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_many_plants_are_single_plants_to_the_bit(mode, rng):
-    shell = {"num_envs": 3, "max_episode_steps": 7}
-    modes = {"vector_kwargs": {"autoreset_mode": mode}, "vectorization_mode": "sync"}
-    many = gymnasium.make_vec("MiddlePoint-v0", **shell, **DRAWN, autoreset_mode=mode)
-    single = gymnasium.make_vec("MiddlePoint-v0", **shell, **DRAWN, **modes)
-    assert data_equivalence(many.reset(seed=3), single.reset(seed=3), exact=True)
-    for actions in rng.uniform(-1.5, 1.5, (30, 3, 1)).astype(np.float32):
-        results = many.step(actions), single.step(actions)
-        assert data_equivalence(results[0][:4], results[1][:4], exact=True)
-
-
-def test_plants_that_are_reset_alone_start_from_a_flow_of_0():
-    many = gymnasium.make_vec("MiddlePoint-v0", 2, dead_zone=0.0, action="change")
-    many.reset(seed=0)
-    many.step(np.ones((2, 1)))
-    many.reset(options={"reset_mask": np.array([True, False])})
-    assert many.step(np.ones((2, 1)))[-1]["command"] == pytest.approx([4.0, 8.0])
-
-
-@pytest.mark.parametrize("n", [1, 2])
-def test_a_bad_action_changes_nothing(n):
-    shape = (1,) if n == 1 else (n, 1)
-    envs = [
-        gymnasium.make("MiddlePoint-v0", **DRAWN)
-        if n == 1
-        else gymnasium.make_vec("MiddlePoint-v0", n, **DRAWN)
-        for _ in range(2)
-    ]
-    with pytest.raises(ResetNeeded):
-        envs[0].step(np.ones(shape))
-    for env in envs:
-        env.reset(seed=0)
-    with pytest.raises(ValueError, match="action"):
-        envs[0].step(np.full(shape, np.nan))
-    results = [env.step(np.ones(shape)) for env in envs]
-    assert data_equivalence(*results, exact=True)

@@ -232,12 +232,11 @@ class TestDirectNN:
     def test_bad_weights_change_nothing(self):
         nn = DirectNNController()
         before = nn.weights
-        others = {field: getattr(before, field) + 1 for field in FIELDS}
         transposed, unknown = np.zeros((6, 3)), np.full((3, 6), np.nan)
         bad = [("W", transposed), ("W", unknown), ("W_1", np.zeros(4)), ("theta_2", [1.0])]
         for field, value in bad:
             with pytest.raises(ValueError, match=rf"weights\.{field}"):
-                nn.weights = Weights(**others | {field: value})
+                nn.weights = Weights(**vars(before) | {field: value})
             assert are_equal(nn.weights, before)
 
     def test_weights_change_at_every_third_sample_while_learning_is_on(self):

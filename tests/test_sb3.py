@@ -17,7 +17,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
-    VecEnvWrapper,
     VecFrameStack,
     VecMonitor,
     VecNormalize,
@@ -192,17 +191,4 @@ class TestScoreCallback:
         model = model_of(make_vec_env(HARD, 2))
         with pytest.raises(Error, match="MiddlePointHard-v00"):
             model.learn(64, ScoreCallback("MiddlePointHard-v00"))
-        model = model_of(Unknown(make_vec_env(HARD, 2)))
-        with pytest.raises(ValueError, match="Unknown, which cannot be made again"):
-            model.learn(64, ScoreCallback(HARD))
         assert model.num_timesteps == 0
-
-
-class Unknown(VecEnvWrapper):
-    """A wrapper of a user."""
-
-    def reset(self):
-        return self.venv.reset()
-
-    def step_wait(self):
-        return self.venv.step_wait()

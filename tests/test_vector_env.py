@@ -13,8 +13,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mptc_gym import MiddlePointVectorEnv
+from mptc_gym import PRESETS, MiddlePointVectorEnv
 from tests.conftest import MODES, NOISY, native_and_sync, random_actions, valid_arguments
+
+CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 5.0}
 
 
 def assert_equal(ours, theirs):
@@ -83,6 +85,7 @@ def test_it_equals_one_environment_after_the_other(
         # An actuator that does not reach zero flow, and one that ends there, at minus zero.
         ("NextStep", 9, 30, {"u_min": 6.0, "u_max": 8.0, "dead_zone": 2.0, "move_weight": 0.5}),
         ("NextStep", 9, 30, {"u_min": -0.0, "dead_zone": 0.0}),
+        *((m, 7, 60, {**PRESETS["hard"], "move_weight": 0.1, **CHANGE}) for m in MODES),
     ],
     ids=str,
 )
