@@ -274,9 +274,9 @@ class TestLeastPossible:
 class TestHedging:
     def test_it_gains_where_levels_are_short(self, monkeypatch):
         short = {"setpoint": "random", "setpoint_period": 120}
-        hedged = mean_error(run_mpc(10, 400, **short)).mean()
+        hedged = mean_error(run_mpc(5, 300, **short)).mean()
         monkeypatch.setattr(RandomSetpoint, "probability_held", lambda *_: np.ones(1))
-        assert hedged < 0.95 * mean_error(run_mpc(10, 400, **short)).mean()
+        assert hedged < 0.95 * mean_error(run_mpc(5, 300, **short)).mean()
 
 
 class TestPredictiveController:

@@ -67,6 +67,7 @@ REFUSED = {
         (["--set", "a=[1,-1.5]"], "--set: a must not have a root beyond the unit circle"),
         (["--set", "render_mode=human"], "unexpected keyword argument 'render_mode'"),
         (["--agent", "PI=agents:PIController"], "a NAME that no other controller has"),
+        (["--agent", "=agents:PIController"], "'=agents:PIController' must have"),
         (["--agent", "mine"], "must have the form NAME=MODULE:FACTORY"),
         (["--agent", "mine=nowhere:PI"], "'nowhere' is no module in the current folder"),
     ],

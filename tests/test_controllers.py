@@ -11,7 +11,6 @@ from stable_baselines3 import PPO
 
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.lib.command import CommandError
 from benchmarks.loop.measures import make_plants, mean_error, rollout
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
@@ -141,18 +140,6 @@ class TestOwnControllers:
         given = member.start({"delay": 3, "u_max": 9.0}, 3, 7)[0].given
         assert (given["num_envs"], given["seed"], given["gain"]) == (3, 7, 2)
         assert (given["parameters"].delay, given["u_max"]) == (3, 9.0)
-
-    @pytest.mark.parametrize("location", ["agents", "nowhere:x", "none.npz", "none.json", ""])
-    def test_bad_locations(self, location):
-        with pytest.raises(CommandError, match=f"--agent: .*mine={location}.* must "):
-            members_of(location)
-
-    @pytest.mark.parametrize("name", ["", "pi", "PI"])
-    def test_bad_names(self, name):
-        with pytest.raises(
-            CommandError, match=f"--agent: '{name}=agents:PIController' must have"
-        ):
-            own_controllers([f"{name}=agents:PIController"])
 
     def test_the_same_name_again_is_another_training(self, written):
         other = written("from agents import PIController as Mine")

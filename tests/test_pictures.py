@@ -15,10 +15,6 @@ from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import SCENARIOS
 
 
-def ticks(axis):
-    return [tick.get_text() for tick in axis.get_ticklabels()]
-
-
 @pytest.fixture
 def figures(monkeypatch):
     """Return the figures that are made, in place of files."""
@@ -42,12 +38,11 @@ def test_scores_beyond_the_axis_stand_at_its_ends(figures, tmp_path):
         for agent, scores in values.items()
         for case, score in zip(["a", "b"], scores, strict=True)
     ]
-    means = {agent: np.mean(scores) for agent, scores in values.items()}
-    scores = {agent: Estimate(mean, mean, mean, 2) for agent, mean in means.items()}
+    scores = {agent: Estimate(*[np.mean(values[agent])] * 3, 2) for agent in values}
     plots.plot_scores(scores, pd.DataFrame(rows), ROSTER, tmp_path / "scores.png")
     (axes,) = figures[0].axes
-    labels = ticks(axes.xaxis)
-    assert (labels[0], labels[-1]) == ("≤ 0", "≥ 0.999")
+    labels = axes.xaxis.get_ticklabels()
+    assert [labels[i].get_text() for i in (0, -1)] == ["≤ 0", "≥ 0.999"]
     shown = np.concatenate([line.get_xdata() for line in axes.get_lines()])
     right, left = sorted(axes.get_xlim())
     assert ((right < shown) & (shown < left)).all()
