@@ -62,6 +62,8 @@ REFUSED = {
         (["--preset", "paper", "--presets"], "--presets cannot be combined with --plant"),
         (["--preset", "paper", "--scenarios", "load"], "no 'load'; choose from square, con"),
         (["--rusn", "3"], "Unknown option: --rusn. Did you mean --runs"),
+        (["--plant", "none.json"], "--plant: .*none.json must be a JSON file.*No such file"),
+        (["--plant", ROOT / "README.md"], "--plant: .*README.md must be a JSON file"),
         (["--set", "delay"], "ARGUMENT=VALUE"),
         (["--set", "dely=3"], "unexpected keyword argument 'dely'"),
         (["--set", "a=[1,-1.5]"], "--set: a must not have a root beyond the unit circle"),

@@ -5,10 +5,8 @@ import pytest
 from scipy import signal
 
 from agents import DahlinController, PIController, SmithPredictor
-from benchmarks.lib.command import CommandError
 from benchmarks.loop.linear import LinearLoop, nominal, step_test, time_constant_for
 from benchmarks.loop.measures import make_plants, rollout
-from benchmarks.loop.scenarios import PlantOptions
 from mptc_gym import MiddlePointEnv, Parameters
 from tests.conftest import STEP_TEST, run
 
@@ -59,20 +57,6 @@ def test_plant_without_a_new_steady_state_is_refused():
             step_test(Parameters(**{name: values}))
     # The gain of one that integrates has a sign.
     assert nominal(Parameters(a=[1.0, -1.0], b=[-0.1])).gain == -np.inf
-
-
-def test_bad_plant_file_is_named(tmp_path):
-    path = tmp_path / "plant.json"
-    for text, complaint in {
-        None: "plant.json must be a JSON file of arguments.*No such file",
-        "{": "plant.json must be a JSON file",
-        "[1, 2]": "plant.json must be a JSON file of arguments",
-        '{"delay": -1}': "delay must be",
-    }.items():
-        if text is not None:
-            path.write_text(text)
-        with pytest.raises(CommandError, match=f"^--plant: .*{complaint}"):
-            PlantOptions(plant=path).arguments()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.lib import outputs
 from benchmarks.lib.command import CommandError
-from benchmarks.lib.outputs import commit, new_folder, provenance_of
+from benchmarks.lib.outputs import commit, new_folder
 from benchmarks.lib.report import Section, on_screen, write_report
 
 
@@ -87,10 +87,3 @@ class TestReport:
         assert width / 2 < max(map(len, shown.splitlines())) <= width
         assert shown.count("11.5") == shown.count("1.00 (0.99 to 1.01)") == 7
         assert shown.startswith("agent ")
-
-
-def test_provenance_names_what_a_result_depends_on():
-    provenance = provenance_of(seeds=[1, 2])
-    assert provenance["seeds"] == [1, 2]
-    assert {"python", "mptc_gym", "numpy"} <= set(provenance["versions"])
-    assert provenance["command"] == outputs.COMMAND_LINE.get()

@@ -10,33 +10,34 @@ from benchmarks.lib import statistics
 from benchmarks.lib.statistics import bootstrap, quantile, share
 from tests.conftest import assert_the_seed_is_all_that_differs
 
-
-def test_median_by_hand():
-    # Of 10 values, the 2nd and the 9th are the narrowest pair that encloses the median with
-    # 95 %: outside of it lie 2 (1 + 10) / 2^10 = 2.1 %, outside the 3rd and 8th 11 %.
-    estimate = quantile([10, 1, 2, 9, 3, 8, 4, 7, 5, 6], 0.5)
-    assert vars(estimate) == {"value": 5.5, "low": 2, "high": 9, "runs": 10}
+SOME_NEVER_END = np.r_[np.arange(1.0, 91.0), [math.inf] * 10]
 
 
-def test_an_interval_is_no_narrower_than_95_percent_asks():
-    # Of 14 values, the 4th and the 11th enclose the median with 94.3 % alone: outside of them
-    # lie 2 (1 + 14 + 91 + 364) / 2^14 = 5.7 %.
-    estimate = quantile(np.arange(1.0, 15.0), 0.5)
-    assert (estimate.low, estimate.high) == (3.0, 12.0)
+@pytest.mark.parametrize(
+    ("values", "level", "expected"),
+    [
+        # Of 10 values, the 2nd and the 9th are the narrowest pair that encloses the median with
+        # 95 %: outside of it lie 2 (1 + 10) / 2^10 = 2.1 %, outside the 3rd and 8th 11 %.
+        ([10, 1, 2, 9, 3, 8, 4, 7, 5, 6], 0.5, (5.5, 2, 9)),
+        # Of 14 values, the 4th and the 11th enclose the median with 94.3 % alone: outside of
+        # them lie 2 (1 + 14 + 91 + 364) / 2^14 = 5.7 %.
+        (np.arange(1.0, 15.0), 0.5, (7.5, 3.0, 12.0)),
+        # Few runs promise little.
+        ([1.0, 2.0, 3.0], 0.5, (2.0, -math.inf, math.inf)),
+        # Some that never end: the next higher of 50 and 51, not between.
+        (SOME_NEVER_END, 0.5, (51.0, 40.0, 61.0)),
+        (SOME_NEVER_END, 0.95, (math.inf, 90.0, math.inf)),
+    ],
+)
+def test_quantiles_by_hand(values, level, expected):
+    estimate = quantile(values, level)
+    assert (estimate.value, estimate.low, estimate.high) == expected
+    assert estimate.runs == len(values)
 
 
-def test_quantile_of_some_that_never_end():
-    values = np.r_[np.arange(1.0, 91.0), [math.inf] * 10]
-    assert quantile(values, 0.5).value == 51  # the next higher of 50 and 51, not between
-    high = quantile(values, 0.95)
-    assert high.value == high.high == math.inf
-
-
-def test_few_runs_promise_little():
+def test_the_interval_of_two_values_is_wide():
     # Student's t of one degree of freedom: 12.7 standard errors.
     assert statistics.student([1.0, 3.0]).high == pytest.approx(2.0 + 12.706, abs=1e-3)
-    estimate = quantile([1.0, 2.0, 3.0], 0.5)
-    assert (estimate.value, estimate.low, estimate.high) == (2.0, -math.inf, math.inf)
 
 
 def test_what_rounds_to_zero_has_no_sign():
