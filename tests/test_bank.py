@@ -89,6 +89,25 @@ class TestOutputFilter:
         load = change**2 * (of_load @ weights) @ surprise
         assert kalman.load[0] == pytest.approx(load, abs=1e-9)
 
+    def test_the_most_likely_filter_distinguishes_a_steady_load_from_noise(self, rng):
+        noise = 0.2 * rng.normal(size=600)
+        calm = self.filtered(np.zeros(600), noise)
+        loaded = self.filtered(np.zeros(600), noise + 2.0 * (np.arange(600) > 300))
+        # The first filter expects the smallest changes of the load.
+        assert calm.weights[0, 0] > 0.4 > loaded.weights[0, 0]
+        assert loaded.load[0] == pytest.approx(2.0, abs=0.3)
+
+    def test_a_load_remains_in_the_forecast_and_noise_does_not(self):
+        pole, fading = np.array([self.POLE]), np.array([self.POLE**19])
+        steady = np.full(200, 0.7)
+        pulse = np.where(np.arange(200) == 199, 0.7, 0.0)
+        of_load, of_noise = (
+            self.filtered(np.zeros(200), outputs).forecast(pole, fading)[0]
+            for outputs in (steady, pulse)
+        )
+        assert 0.55 < of_load < 0.7
+        assert 0.0 < of_noise < 0.3
+
 
 class TestRandomSetpoint:
     SETPOINT = RandomSetpoint(shortest=100.0, longest=300.0, amplitude=5.0)
