@@ -101,12 +101,12 @@ class TestOutputFilter:
         pole, fading = np.array([self.POLE]), np.array([self.POLE**19])
         steady = np.full(200, 0.7)
         pulse = np.where(np.arange(200) == 199, 0.7, 0.0)
-        of_load, of_noise = (
-            self.filtered(np.zeros(200), outputs).forecast(pole, fading)[0]
-            for outputs in (steady, pulse)
+        loaded, disturbed = (
+            self.filtered(np.zeros(200), outputs) for outputs in (steady, pulse)
         )
-        assert 0.55 < of_load < 0.7
-        assert 0.0 < of_noise < 0.3
+        assert 0.55 < loaded.forecast(pole, fading)[0] < 0.7
+        later, soon = (disturbed.forecast(pole, share)[0] for share in (fading, pole))
+        assert 0.0 < later < min(soon, 0.3)
 
 
 class TestRandomSetpoint:

@@ -104,8 +104,11 @@ class TestSearch:
             gains = {"kp": row.kp, "ki": row.ki}
             new_runs = tune.score("pi", {}, 3, tune.FINAL_FIRST_RUN, gains)
             assert row.objective == new_runs["objective"]
-        best_of_search = np.sort(trials["objective"])[:2]
-        assert np.sort(table["in the search"][:2]) == pytest.approx(best_of_search)
+        best = trials.nsmallest(2, "objective").sort_values("kp")
+        finalists = table[:2].sort_values("kp")
+        assert [*finalists["in the search"]] == pytest.approx([*best["objective"]])
+        assert [*finalists["kp"]] == [float(f"{kp:.3g}") for kp in best["kp"]]
+        assert table["objective"][:2].is_monotonic_increasing
         written = json.loads((tmp_path / "search/gains.json").read_text())["gains"]
         assert written == table.loc[0, ["kp", "ki"]].to_dict()
 
