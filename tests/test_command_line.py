@@ -3,7 +3,6 @@
 import importlib
 import os
 import re
-import shlex
 import signal
 import subprocess
 import sys
@@ -13,7 +12,6 @@ import pytest
 
 pytest.importorskip("cyclopts", reason="the commands need the extra compare")
 
-from benchmarks.lib.command import read
 from tests.conftest import ROOT, python
 
 # The modules of the commands `python -m benchmarks.NAME`, by NAME.
@@ -121,19 +119,6 @@ def test_the_list_shows_the_questions_and_their_commands():
     )
     assert "](" not in done.stdout
     assert {*re.findall(r"benchmarks\.(\w+)", done.stdout)} == {*COMMANDS}
-
-
-@pytest.mark.parametrize(
-    "page",
-    [ROOT / "README.md", *(ROOT / "benchmarks").rglob("*.md")],
-    ids=lambda page: str(page.relative_to(ROOT)),
-)
-def test_a_command_on_a_page_can_be_typed_as_it_stands(page):
-    text = page.read_text("utf-8").replace("\\\n", "").replace("\\`", "`")
-    for name, options in re.findall(r"python -m benchmarks\.([\w.]+)([^`|#\n]*)", text):
-        if name in COMMANDS:  # an example takes no options
-            declared = importlib.import_module(COMMANDS[name]).Options
-            assert read(declared, name, shlex.split(options)), name
 
 
 # A command as all are: it fans out, and writes what has finished, however it ends.
