@@ -154,7 +154,11 @@ sys.exit(command("toy", Options, work)())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no signals to other processes")
-def test_after_ctrl_c_what_has_finished_is_written(tmp_path):
+# A terminal sends Ctrl-C to all processes, and a scheduler stops the first one.
+@pytest.mark.parametrize(
+    ("send", "number"), [("killpg", signal.SIGINT), ("kill", signal.SIGTERM)]
+)
+def test_after_a_stop_what_has_finished_is_written(send, number, tmp_path):
     words = ["--seconds", "60", "--jobs", "2", "--out", tmp_path]
     run = subprocess.Popen(
         [sys.executable, "-c", TOY, *words], cwd=ROOT, text=True,
@@ -162,7 +166,7 @@ def test_after_ctrl_c_what_has_finished_is_written(tmp_path):
     )  # fmt: skip
     assert run.stdout.readline() == "up\n"
     time.sleep(2.0)  # until the other processes work
-    os.killpg(run.pid, signal.SIGINT)  # as a terminal sends it
+    getattr(os, send)(run.pid, number)
     out, err = run.communicate(timeout=60)
     assert run.returncode == 130
     assert out.endswith("5 \N{DEGREE SIGN}C\n")

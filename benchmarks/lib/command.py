@@ -9,6 +9,7 @@ imported inside the function `work`, so that `--help` is quick.
 import inspect
 import os
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Collection, Sequence
 from contextvars import ContextVar
@@ -48,7 +49,7 @@ class CommandError(Exception):
         What is wrong, with the value and what is allowed.
     status
         Exit status of the command: 1 if tasks failed, 2 if the command line or a file that it
-        names is wrong, and 130 after Ctrl-C.
+        names is wrong, and 130 after Ctrl-C or SIGTERM.
     """
 
     def __init__(self, message: str, status: int = 2) -> None:
@@ -132,8 +133,8 @@ def command(
     `main(words)` converts the command-line words `words` (default: `sys.argv[1:]`) to options,
     calls `work` with the options, and returns the exit status: 0 for success; 1 if tasks
     failed, or if a file could not be read or written; 2 if an option is wrong or a Python
-    package is missing; and 130 after Ctrl-C. An error message on the standard error stream
-    begins with the name of the command.
+    package is missing; and 130 after Ctrl-C or SIGTERM. An error message on the standard error
+    stream begins with the name of the command.
 
     Parameters
     ----------
@@ -171,7 +172,9 @@ def command(
 
 
 def _leave_surroundings() -> None:
-    """Make pictures and texts independent of the notebook or terminal that calls a command."""
+    """Make a command independent of the notebook, terminal or scheduler that calls it."""
+    # A scheduler stops a command by SIGTERM, which else would leave processes that run tasks.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     # A notebook names a backend that need not be installed here. No picture needs a screen.
     os.environ["MPLBACKEND"] = "agg"
     # A terminal without Unicode shows "?" in place of a degree sign.
