@@ -132,7 +132,9 @@ def work(options: Options) -> None:
     write_report(folder, f"Gains: {ROSTER[name].label}", [best], provenance)
     show(best)
     run = f"python -m benchmarks.compare --agent my-{name}={folder}/gains.json"
-    print(f"To run the best gains on a plant: {run}")
+    if options.plant.plant:
+        run += f" --plant {options.plant.plant}"
+    print(f"To run the best gains: {run}")
 
 
 def finals(name: str, plant: Arguments, gains: list[str], trials: pd.DataFrame) -> pd.DataFrame:

@@ -190,8 +190,8 @@ def _make_plants(policy: Any, env: Any, n: int, arguments: Mapping[str, Any]) ->
         return gymnasium.make_vec(env, n, **arguments)
     if not callable(env):
         allowed = (
-            "an id, an EnvSpec or a function that makes a new environment, such as lambda: ... "
-            "(for a Stable-Baselines3 model with its environments, leave env out)"
+            "an id, an EnvSpec such as that of an environment, or a function that makes a new "
+            "environment, such as lambda: ..."
         )
         reject("env", env, allowed)
     if arguments:
@@ -274,9 +274,12 @@ def _freeze_statistics(plants: Plants) -> None:
         statistics = vars(layer).get("obs_rms", {})
         parts = statistics.values() if isinstance(statistics, dict) else [statistics]
         if any(part.count < 1.0 for part in parts):
+            advice = "set its obs_rms to that of the training"
+            if "norm_obs" in vars(layer):
+                advice = "write VecNormalize.load(path, env)"
             raise ValueError(
                 f"env must have the statistics of the policy's training in "
-                f"{type(layer).__name__}, got initial ones: write VecNormalize.load(path, env)"
+                f"{type(layer).__name__}, got initial ones: {advice}"
             )
 
 
@@ -299,10 +302,12 @@ def _check_fit(policy: Any, plants: Plants, *, is_made_by_user: bool) -> None:
         expected_spaces = policy.observation_space.shape, policy.action_space
         spaces = plants.single_observation_space.shape, plants.single_action_space
         if spaces != expected_spaces:
+            advice = "leave out the arguments that change them"
+            if training is None:
+                advice = "load the model with its environments, PPO.load(path, env=...)"
             raise ValueError(
                 f"env must have the observations and actions of the policy's training, "
-                f"{expected_spaces}, got {spaces}: load the model with its environments, "
-                "PPO.load(path, env=...)"
+                f"{expected_spaces}, got {spaces}: {advice}"
             )
 
 

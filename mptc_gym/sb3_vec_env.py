@@ -11,7 +11,7 @@ from typing import Any, NoReturn, cast
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import (
@@ -281,6 +281,12 @@ def like(
 
 def _in_layers_of(training: VecEnv, plants: VecEnv) -> VecEnv:
     """Return plants in the wrappers of Stable-Baselines3 that are around `training`."""
+    if isinstance(training, GymnasiumVecEnv):
+        batch: Any = training.batch
+        while isinstance(batch, VectorWrapper):
+            if type(batch).__name__ not in _RECORDERS:
+                _refuse(batch)
+            batch = batch.env
     if not isinstance(training, VecEnvWrapper):
         return plants
     plants = _in_layers_of(training.venv, plants)
@@ -291,9 +297,14 @@ def _in_layers_of(training: VecEnv, plants: VecEnv) -> VecEnv:
         return frozen
     if isinstance(training, VecFrameStack):
         return VecFrameStack(plants, training.stacked_obs.n_stack)
-    if isinstance(training, _VEC_RECORDERS):
-        return plants
+    if not isinstance(training, _VEC_RECORDERS):
+        _refuse(training)
+    return plants
+
+
+def _refuse(wrapper: Any) -> NoReturn:
+    """Raise a ValueError that names a wrapper around the environments of a training."""
     raise ValueError(
-        f"the model's environments are in a {type(training).__name__}, which cannot be made "
+        f"the model's environments are in a {type(wrapper).__name__}, which cannot be made "
         "again: pass evaluate a function that makes such environments"
     )

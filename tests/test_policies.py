@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import (
 from agents import DirectNNController, PIController
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, evaluate
 from mptc_gym.evaluation import SEED
-from mptc_gym.sb3 import like, make_vec_env
+from mptc_gym.sb3 import GymnasiumVecEnv, like, make_vec_env
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 NOISY = "MiddlePointNoisy-v0"
@@ -380,7 +380,12 @@ REFUSED = {
     "an environment": lambda _: (idle, one(), "such as lambda: ..."),
     "a vector environment": lambda _: (idle, many(), "function that makes a new environment"),
     "a VecEnv": lambda _: (
-        (m := model_of(dummy())), m.get_env(), "with its environments, leave env out"),
+        (m := model_of(dummy())), m.get_env(), "an EnvSpec such as that of an environment"),
+    "a wrapper of a batch": lambda _: (
+        model_of(GymnasiumVecEnv(wrappers.vector.VectorizeTransformAction(
+            many(autoreset_mode="SameStep"), wrappers.RescaleAction,
+            min_action=-2.0, max_action=2.0))),
+        NOISY, "are in a VectorizeTransformAction, which cannot be made again"),
     "the same environment": lambda _: (idle, maker_of(one()), "a new environment at each call"),
     "the same inner environment": lambda _: (
         idle, partial(VecMonitor, dummy()), "a new environment at each call"),
@@ -492,3 +497,8 @@ def test_an_episode_has_at_most_1200_samples():
         assert evaluate(law, plants, episodes=2).score is not None
     for limit in (-1, 2000):
         assert evaluate(law, episodes=2, max_episode_steps=limit).score is not None
+
+
+def test_arguments_that_change_the_observations_of_a_model_are_refused():
+    with pytest.raises(ValueError, match="leave out the arguments that change them"):
+        evaluate(model_of(dummy()), NOISY, episodes=2, action_window=5)
