@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import wrappers
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorWrapper
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.monitor import Monitor
@@ -382,10 +382,8 @@ REFUSED = {
     "a VecEnv": lambda _: (
         (m := model_of(dummy())), m.get_env(), "an EnvSpec such as that of an environment"),
     "a wrapper of a batch": lambda _: (
-        model_of(GymnasiumVecEnv(wrappers.vector.VectorizeTransformAction(
-            many(autoreset_mode="SameStep"), wrappers.RescaleAction,
-            min_action=-2.0, max_action=2.0))),
-        NOISY, "are in a VectorizeTransformAction, which cannot be made again"),
+        model_of(GymnasiumVecEnv(VectorWrapper(many(autoreset_mode="SameStep")))),
+        NOISY, "are in a VectorWrapper, which cannot be made again"),
     "the same environment": lambda _: (idle, maker_of(one()), "a new environment at each call"),
     "the same inner environment": lambda _: (
         idle, partial(VecMonitor, dummy()), "a new environment at each call"),
