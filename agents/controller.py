@@ -194,7 +194,7 @@ class Controller(ABC):
         ----------
         observation
             Observation of shape (n_obs,) for one loop, or (batch, n_obs) for a batch of loops.
-            The values of elements that the controller does not need have no effect. A
+            Elements that the controller does not need must be finite, but have no effect. A
             `PolicyNetwork` needs exactly n_obs elements, and other controllers at least n_obs.
 
         Returns

@@ -70,6 +70,7 @@ class DahlinController(InternalModelController):
         self._check(not_negative, "filter_time_constant")
         self._check(from_0, "setpoint_index", "error_index")
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
+        # The shares g and f of a distance that are covered per sample; f = 1 is no filter.
         self._approach = -math.expm1(-self.sampling_interval / self.closed_loop_time_constant)
         self._filter = 1.0
         if self.filter_time_constant > 0.0:

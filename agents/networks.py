@@ -247,7 +247,8 @@ class PolicyNetwork(Controller):
         received = {name: getattr(parameters, name) for name in names}
         if received != expected:
             raise ValueError(
-                f"env must have the arguments of policy's training, {expected}, got {received}"
+                f"env must have the arguments with which the policy was trained, {expected}, "
+                f"got {received}"
             )
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:

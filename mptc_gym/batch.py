@@ -191,7 +191,9 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
 
         self._clock += 1
         observations, rewards, terminations, truncations, infos = self._advance(a)
-        if self._clock < self._next_end:  # the usual case: no episode ends or begins
+        if (
+            self._clock < self._next_end
+        ):  # the usual case: no episode ends, and no reset is pending
             return observations, rewards, terminations, truncations, infos
         if reset_now is not None:
             rewards = self._where(self._as_array(reset_now), 0, rewards)

@@ -268,10 +268,11 @@ class _Plants:
         """Bring the plants in `mask` to rest, with the parameter values `numbers`."""
         self._numbers = numbers
         for rows in (self._flows, self._past_outputs):
-            rows.extend([row.masked_fill(mask, 0.0) for row in rows])  # drops the old rows
+            rows.extend([row.masked_fill(mask, 0.0) for row in rows])  # pushes out the old rows
         # The action form "change" rounds to float32.
         is_float32 = self._parameters.action == "change" or self._zeros.dtype == torch.float32
-        # Bound of the relative error of eight roundings, each of at most half an eps.
+        # A command is scaled to an action and back in up to eight operations, each with a
+        # relative error of at most half an eps.
         rounding = 4.0 * torch.finfo(torch.float32 if is_float32 else torch.float64).eps
         self._edge = self._zeros + least_effective_command(
             numbers.dead_zone, *self._limits, rounding

@@ -174,8 +174,8 @@ def test_some_controllers_refuse_more_plants():
     another_dead_zone = network.interface | {"compensated_dead_zone": 7.0}
     network.check_environment(Parameters(**another_dead_zone), 5)
     for other, complaint in (
-        ({"output_window": 3}, "arguments of policy's training"),
-        ({"max_move": 0.4}, "arguments of policy's training"),
+        ({"output_window": 3}, "arguments with which the policy was trained"),
+        ({"max_move": 0.4}, "arguments with which the policy was trained"),
         ({"action": "flow"}, "must have action='change'"),
     ):
         with pytest.raises(ValueError, match=complaint):

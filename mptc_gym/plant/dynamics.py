@@ -193,12 +193,12 @@ class Dynamics:
         self._drift_samples = parameters.drift_samples
         self._negated_a = [-coefficient for coefficient in parameters.a[1:]]
         self._sum_of_a = sum(parameters.a)  # A(1)
-        # The coefficients of Q from z^0 on, followed by 0. The list is empty if the time
-        # constant never changes.
+        # The coefficients of Q, with A = Q times 1 - p z^-1, followed by a 0 that makes them as
+        # long as A. The list is empty if the time constant never changes.
         self._quotient: list[float] = []
         if parameters.changes_time_constant:
             pole = slowest_pole(parameters.a).real  # a real one, as Parameters has checked
-            self._rate = 1.0 - pole
+            self._rate = 1.0 - pole  # 1 / time constant, per sample
             quotient, _remainder = np.polydiv(parameters.a, [1.0, -pole])
             self._quotient = [*quotient.tolist(), 0.0]
 
