@@ -67,14 +67,14 @@ class TestReport:
     def test_a_page(self, tmp_path):
         table = pd.DataFrame({"a|b": ["a < b", "c"], "value": ["1.0 (0.9 to 1.1)", "[1, 2]"]})
         pictures = {"picture.png": "What it shows"}
-        first = Section("First", ["Some text."], table, bold=["c"], pictures=pictures)
+        first = Section("First", ["Some text."], table, pictures)
         error = CommandError("1 of 2 tasks are missing\npi: why")
         write_report(tmp_path, "Title", [first, Section("Second")], PROVENANCE, error)
         page = (tmp_path / "report.md").read_text()
         assert page.startswith("# Title\n\n**Unfinished: 1 of 2 tasks are missing.**\n\n## Fir")
         assert "## First\n\nSome text.\n\n| a\\|b " in page
         assert "| a &lt; b | 1.0 (0.9 to 1.1) |" in page
-        assert "| **c**    | [1, 2] " in page
+        assert "| c        | [1, 2] " in page
         assert "\n\n![What it shows](picture.png)\n\n## Second\n\nmade today" in page
         assert page.endswith("made today, commit abcd-dirty: python -m x \\| y\n")
 

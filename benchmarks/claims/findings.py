@@ -153,7 +153,7 @@ def sections(claims: Mapping[str, Any], numbers: pd.DataFrame) -> list[Section]:
         title = f"{claim.statement}: {rows['verdict'].iloc[0]}"
         formatted = _formatted(measured) if len(measured) else None
         text = f"{claim.section}. {claim.method}"
-        report.append(Section(title, [text], formatted, bold=["no"]))
+        report.append(Section(title, [text], formatted))
     return report
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import textwrap
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,6 @@ class Section:
         Paragraphs of the section, above the table.
     table : pandas.DataFrame, optional
         Table whose cells are texts; None for a section without a table.
-    bold : collection of str
-        Texts that are shown in bold type in the cells of the table.
     pictures : mapping
         Caption of each picture, by the name of the PNG file in the folder of the report.
     """
@@ -36,8 +34,7 @@ class Section:
     title: str
     text: Sequence[str] = ()
     table: pd.DataFrame | None = None
-    bold: Collection[str] = field(default=(), kw_only=True)
-    pictures: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    pictures: Mapping[str, str] = field(default_factory=dict)
 
 
 def write_report(
@@ -75,15 +72,11 @@ def write_report(
 
 def _in_markdown(section: Section) -> list[str]:
     """Return a section as blocks of Markdown, such as a heading, a paragraph or a table."""
-
-    def cell(text: object) -> str:
-        return f"**{escape(text)}**" if text in section.bold else escape(text)
-
     blocks = [escape(text) for text in section.text]
     if section.title:
         blocks.insert(0, f"## {escape(section.title)}")
     if section.table is not None:
-        cells = section.table.astype(object).map(cell).rename(columns=escape)
+        cells = section.table.astype(object).map(escape).rename(columns=escape)
         blocks.append(str(cells.to_markdown(index=False, disable_numparse=True)))
     blocks += [f"![{escape(text)}]({name})" for name, text in section.pictures.items()]
     return blocks
