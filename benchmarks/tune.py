@@ -102,6 +102,8 @@ class Options:
 
 def work(options: Options) -> None:
     """Search for gains, write the results, and print the best gains."""
+    import optuna  # noqa: F401 (an error, if it is missing, before a folder is made)
+
     from benchmarks.lib.report import Section, show, write_report
 
     name = options.controller

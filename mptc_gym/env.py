@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from copy import copy
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
@@ -20,9 +20,7 @@ from mptc_gym.plant.dynamics import Plant, WantedFlows, action_from_command
 from mptc_gym.plant.parameters import Parameters, full_signature, insert_table
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import ONLY_PLANT, Signals
-
-if TYPE_CHECKING:
-    from mptc_gym.rendering import Record
+from mptc_gym.record import Record
 
 EPISODE_STEPS = 1200  # samples after which the registered environments truncate an episode
 # The arguments that the `EnvSpec` of a batch has in addition to those of its plants.
@@ -263,7 +261,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     For an invalid argument or `render_mode`, the constructor raises a `ValueError` that names
     the argument. For an unknown argument, the constructor raises a `TypeError`. If an action is
     not one finite number, `step` raises a `ValueError` and leaves the plant unchanged. Without
-    pygame, `reset` raises `DependencyNotInstalled` in an environment with a render mode.
+    pygame, `render` raises `DependencyNotInstalled` in an environment with a render mode.
 
     ## Version history
 
@@ -328,11 +326,6 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         info : dict of float
             The info at sample k = 0, with the values that `reset` sampled for arguments that
             are ranges.
-
-        Raises
-        ------
-        DependencyNotInstalled
-            If the environment has a render mode, and pygame is not installed.
         """
         super().reset(seed=seed)
         if self._root is not self.np_random:  # at the first reset, or after a new seed
@@ -359,8 +352,6 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         self._window[output_index] = 0.0
         self._window[action_index] = rest_action
         if self.render_mode is not None:
-            from mptc_gym.rendering import Record  # which needs pygame
-
             self._record = Record(numbers, self.parameters.sampling_interval, setpoint)
         if self.render_mode == "human":
             self.render()

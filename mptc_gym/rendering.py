@@ -1,14 +1,13 @@
 """Draw pictures of an episode with pygame: a panel of temperatures above a panel of flows."""
 
 import math
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
-from mptc_gym.plant.parameters import PlantNumbers
+from mptc_gym.record import Record
 
 try:
     import pygame
@@ -20,7 +19,6 @@ except ImportError as error:
 Colour = tuple[int, int, int]  # red, green and blue, 0 to 255
 Label = tuple[str, Colour, Colour]  # a text, the text's colour and the background's
 
-FEWEST_SAMPLES = 200  # in a picture, about 27 minutes of 8 s samples
 SIZE = 960, 540  # width and height of the picture, pixels
 # The panels: left edge, upper edge, width and height, in pixels from the upper left corner.
 TEMPERATURES = pygame.Rect(72, 44, 864, 214)
@@ -38,56 +36,6 @@ GRID = (236, 237, 240)
 TEXT = (60, 64, 70)
 WHITE = (255, 255, 255)
 clock = pygame.time.Clock()  # limits the frame rate of the window
-
-
-class Record:
-    """The latest samples of an episode, from which a picture is drawn.
-
-    A record holds only numbers and no pygame objects, so that an environment can be copied
-    together with its record.
-
-    Attributes
-    ----------
-    plant : PlantNumbers
-        Parameter values of the plant in this episode, such as delay, dead zone and limits.
-    sampling_interval : float
-        Sampling interval, s.
-    span : int
-        Number of samples between the left edge and the right edge of a picture.
-    infos : deque of dict
-        Infos of the latest samples, as many as a picture shows, the newest last.
-    k : int
-        Sample number of the newest sample.
-    extremes : tuple of float
-        Lowest and highest of 0 and of all set points and temperatures of the episode, degC.
-        With the extremes of the visible samples alone, the axis would change often.
-    """
-
-    def __init__(
-        self, plant: PlantNumbers[float], sampling_interval: float, setpoint: float
-    ) -> None:
-        """Begin the record at sample k = 0, at rest, with the set point `setpoint`, degC."""
-        self.plant = plant
-        self.sampling_interval = sampling_interval
-        self.span = max(FEWEST_SAMPLES, 4 * int(plant.delay))
-        self.infos: deque[dict[str, float]] = deque(maxlen=self.span + 1)
-        self.k = -1  # no sample yet
-        self.extremes = 0.0, 0.0
-        at_rest = {"output": 0.0, "command": 0.0, "applied": 0.0}
-        self.add({"setpoint": setpoint, "error": setpoint, **at_rest})
-
-    def add(self, info: Mapping[str, float]) -> None:
-        """Add the next sample of the episode, by the info that `step` returns."""
-        self.k += 1
-        self.infos.append(dict(info))  # a copy, as the caller may change the info
-        # Bounded, as the temperature of an unstable plant may grow beyond all floats.
-        output = max(-1e12, min(1e12, info["output"]))
-        temperatures = *self.extremes, info["setpoint"], output
-        self.extremes = min(temperatures), max(temperatures)
-
-    def latest(self, name: str) -> list[float]:
-        """Return the entries `name` of the infos of the latest samples, the newest last."""
-        return [info[name] for info in self.infos]
 
 
 class Panel:

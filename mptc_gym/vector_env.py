@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import logger
@@ -20,9 +20,7 @@ from mptc_gym.plant.dynamics import PlantBatch, WantedFlows, action_from_command
 from mptc_gym.plant.parameters import Parameters, full_signature
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
-
-if TYPE_CHECKING:
-    from mptc_gym.rendering import Record
+from mptc_gym.record import Record
 
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 
@@ -246,8 +244,6 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._actions[which] = rest_action
         self._window.reset(which, setpoint, rest_action)
         if self.render_mode is not None:
-            from mptc_gym.rendering import Record  # which needs pygame
-
             interval = self.parameters.sampling_interval
             for place, i in enumerate(which.tolist()):
                 numbers_of_plant = plant_numbers(numbers, place)

@@ -183,5 +183,6 @@ def test_what_cannot_be_drawn_is_said(make, monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)  # not installed
     monkeypatch.delitem(sys.modules, "mptc_gym.rendering")
     monkeypatch.delattr(mptc_gym, "rendering")
+    env.reset(seed=0)  # as in Stable-Baselines3's make_vec_env, which asks for pictures
     with pytest.raises(DependencyNotInstalled, match=r'pip install "mptc_gym\[render\]"'):
-        env.reset(seed=0)
+        env.render()
