@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -102,10 +103,11 @@ class Options:
 
 def work(options: Options) -> None:
     """Search for gains, write the results, and print the best gains."""
-    import optuna  # noqa: F401 (an error, if it is missing, before a folder is made)
+    import optuna  # here, so that no folder is made if Optuna is missing
 
     from benchmarks.lib.report import Section, show, write_report
 
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = options.controller
     plant = options.plant.arguments()
     try:
@@ -133,10 +135,8 @@ def work(options: Options) -> None:
     best = Section(title, [NOTE], texts.replace("nan", ""))
     write_report(folder, f"Gains: {ROSTER[name].label}", [best], provenance)
     show(best)
-    run = f"python -m benchmarks.compare --agent my-{name}={folder}/gains.json"
-    if options.plant.plant:
-        run += f" --plant {options.plant.plant}"
-    print(f"To run the best gains: {run}")
+    words = ["--agent", f"my-{name}={folder}/gains.json", *options.plant.words]
+    print(f"To run the best gains: python -m benchmarks.compare {shlex.join(words)}")
 
 
 def finals(name: str, plant: Arguments, gains: list[str], trials: pd.DataFrame) -> pd.DataFrame:
@@ -241,7 +241,6 @@ def search(name: str, plant: Arguments, spans: Spans, count: int, folder: Path) 
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend
 
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(
         storage=JournalStorage(JournalFileBackend(str(folder / "trials.log"))),
         study_name=json.dumps([name, plant]),

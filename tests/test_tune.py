@@ -69,11 +69,12 @@ def test_cases_scale_with_the_plant():
     assert cases["noise"].arguments["noise_variance"] == pytest.approx(0.8)
 
 
-def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path):
+def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path, capsys):
     plant = tmp_path / "plant.json"
     plant.write_text(json.dumps({"b": [0.0456, 0.00404]}))
-    words = f"pi --trials 3 --plant {plant} --out {tmp_path}/pi"
-    assert tune.main(words.split()) == 0
+    chosen = f"--plant {plant} --set dead_zone=5.0"
+    assert tune.main(f"pi --trials 3 {chosen} --out {tmp_path}/pi".split()) == 0
+    assert capsys.readouterr().out.strip().endswith(f"my-pi={tmp_path}/pi/gains.json {chosen}")
     file = tmp_path / "pi/gains.json"
     gains = json.loads(file.read_text())["gains"]
     assert gains["kp"] < 0.0

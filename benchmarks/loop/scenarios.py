@@ -138,6 +138,18 @@ class PlantOptions:
         file = self.plant.stem if self.plant else None
         return ", ".join(filter(None, [self.preset, file, *self.set]))
 
+    @property
+    def words(self) -> list[str]:
+        """The words on a command line that choose this plant, such as ["--preset", "hard"]."""
+        words: list[str] = []
+        if self.plant:
+            words += ["--plant", str(self.plant)]
+        if self.preset:
+            words += ["--preset", self.preset]
+        for argument in self.set:
+            words += ["--set", argument]
+        return words
+
     def cases(self, default: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
         """Return the cases of the chosen plant by name, or `default` if no plant is chosen.
 
