@@ -106,9 +106,10 @@ class SmithPredictor(InternalModelController):
         """Return the commands u(k), t/h, shape (loops,), and update the model's state."""
         in_transit = self._undelayed - self._delayed
         error = rows[:, self.error_index] - in_transit
-        gain = self.kp + self.ki  # factor of the present error, which is also in the sum
-        wanted = self._integral - gain * error
+        # The integral does not contain the present error yet.
+        error_gain = self.kp + self.ki
+        wanted = self._integral - error_gain * error
         # For anti-windup, the integral follows the clipped flow instead of the wanted flow.
         limited = np.clip(wanted, self.u_min, self.u_max)
-        self._integral = self._integral + self.ki / gain * (limited - self._integral)
+        self._integral = self._integral + self.ki / error_gain * (limited - self._integral)
         return self._command(wanted)

@@ -81,7 +81,7 @@ class ScoreCallback(BaseCallback):
         self.arguments = arguments
         self.scores: list[tuple[int, Evaluation]] = []
         self.best: Evaluation | None = None
-        self._scored_weights = torch.empty(0)
+        self._scored_weights = torch.empty(0)  # of the latest score; none yet
 
     def _on_training_start(self) -> None:
         """Raise an error before the training, and not after it, if `like` cannot work."""

@@ -199,6 +199,7 @@ class _Load(_Signal):
 
     def next(self, samples: int, age: Age) -> Tensor:
         is_due = age % LOAD_INTERVAL == 0
+        # A tensor is not tested, as the test would wait for the device.
         if isinstance(is_due, Tensor) or is_due:
             numbers = self._numbers
             jumps = self._uniform(0.0, 1.0) < LOAD_INTERVAL / numbers.disturbance_interval

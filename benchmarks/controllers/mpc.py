@@ -228,7 +228,8 @@ class PredictiveController:
 
         The forecast is the expected value of the output y(k + d + 1) at sample k, where d is
         the plant's delay in samples. The standard deviation is that of a Kalman filter after
-        `WARM_UP` samples, computed without drift of the plant.
+        `WARM_UP` samples, computed without drift of the plant. The method resets the controller
+        and changes its covariance.
         """
         self.reset()
         plants = self._model(0).plants
@@ -236,6 +237,8 @@ class PredictiveController:
             self._update_covariance(*self._transition(k, plants))
         P = self._covariance
         variance = np.zeros(self._num_envs)
+        # Element 0 of the state is the output. After `delay` + 1 steps, P belongs to the output
+        # y(k + delay + 1), and is the one of the runs with this delay.
         for delay in range(self._longest_delay + 1):
             F, Q = self._transition(WARM_UP + delay, plants)
             P = F @ P @ F.transpose(0, 2, 1) + Q
@@ -331,9 +334,10 @@ class PredictiveController:
 
         A first flow inside the dead zone is replaced by 0 or by the flow at the edge of the
         dead zone, whichever gives the plan with the lower cost after the later flows have been
-        planned anew. A plan has the planned flows of all runs, t/h, shape (HORIZON, runs). The
-        returned command is in t/h and has the shape (runs,). `slopes` has the negative
-        derivative of the cost by each planned flow, at a plan of zeros, as in `_Model.cost`.
+        planned again with this first flow. A plan has the planned flows of all runs, t/h, shape
+        (HORIZON, runs). The returned command is in t/h and has the shape (runs,). `slopes` has
+        the negative derivative of the cost by each planned flow, at a plan of zeros, as in
+        `_Model.cost`.
         """
         numbers = self._numbers
         flow = plan[0]
@@ -341,7 +345,8 @@ class PredictiveController:
         if not is_inside.any():
             return plan, flow
         edge = np.copysign(numbers.dead_zone, flow)
-        # The flow differs from the command if a limit lies inside the dead zone.
+        # The actuator clips the command `edge` to its limits, one of which may lie inside the
+        # dead zone.
         edge_flow = applied_flow(edge, numbers.dead_zone, numbers.u_min, numbers.u_max)
         idle_plan = self._optimise(model, slopes, plan, first_flow=0.0)
         edge_plan = self._optimise(model, slopes, plan, first_flow=edge_flow)

@@ -150,11 +150,11 @@ def command(
     def main(words: Sequence[str] | None = None) -> int:
         if words is None:  # The process was started for this command only.
             words = sys.argv[1:]
-            _leave_surroundings()
+            _ignore_surroundings()
         COMMAND_LINE.set(shlex.join([*program.split(), *words]))
         try:
             chosen = read(declared, program, words)
-            if chosen is not None:
+            if chosen is not None:  # None after --help
                 work(chosen)
             return 0
         except CommandError as error:
@@ -171,7 +171,7 @@ def command(
     return main
 
 
-def _leave_surroundings() -> None:
+def _ignore_surroundings() -> None:
     """Make a command independent of the notebook, terminal or scheduler that calls it."""
     # A scheduler stops a command by SIGTERM, which else would leave processes that run tasks.
     signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -149,13 +149,13 @@ def with_progress_bar(items: Iterable[Item], title: str, total: int) -> Iterable
 
 
 def _connect_to_ray() -> None:
-    """Connect to the Ray cluster at RAY_ADDRESS, or on this machine, and send it the code."""
+    """Send the code to the Ray cluster that runs at RAY_ADDRESS, or else on this machine."""
     import ray  # imported here, as it is optional and slow to import
     from ray.util.joblib import register_ray
 
     register_ray()
-    # "/*" excludes all files and folders, and a pattern with "!", as in .gitignore, includes
-    # the code again, with the user's own modules.
+    # "/*" excludes everything. A pattern with "!", as in .gitignore, brings back the code and
+    # the user's own modules.
     excluded = ["/*", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py"]
     code = {"working_dir": str(ROOT), "excludes": excluded}
     ray.init("auto", runtime_env=code, log_to_driver=False)

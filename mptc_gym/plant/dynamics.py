@@ -560,7 +560,7 @@ class _InputResponse:
             self._delayed_indices[:, plants] = rows * self._num_envs + plants
 
     def add(self, applied: Values) -> Values:
-        """Store the applied flows u_a(k), and return the response to all flows so far, degC.
+        """Store the applied flows u_a(k), and return the part of y(k+1) from past flows, degC.
 
         `applied` holds the flows u_a(k) of the plants in t/h, shape (n,). The returned
         response, shape (n,), is the part B(z^-1) u_a(k+1-d) of the temperatures y(k+1), with
@@ -572,6 +572,7 @@ class _InputResponse:
         if self._next_row == self._block_rows:
             self._respond()
             self._next_row = 0
+        # Computed when the latest block was full: no later flow changes it.
         response: Values = self._response[self._next_row]
         return response
 

@@ -346,8 +346,8 @@ class Disturbance(_HeldSignal):
         self.present[plants] = 0.0
         self._due[plants] = self._clock + LOAD_INTERVAL
         self._earliest_due = int(self._due.min())
-        # Samples of the load that the next call of `ahead` returns first: 0 until the first
-        # change.
+        # Samples of the load of one plant that the next call of `ahead` returns first: 0 at the
+        # samples 1 to `LOAD_INTERVAL` - 1, until the first change.
         self._surplus = [0.0] * (LOAD_INTERVAL - 1)
 
     def ahead(self) -> list[float]:
