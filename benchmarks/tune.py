@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -14,17 +14,17 @@ import numpy as np
 
 from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.controllers.spans import Spans
+from benchmarks.controllers.spans import PAPER, SPANS, Spans, spans_for
 from benchmarks.lib.command import CommandError, Count, Folder, Parameter, command, options
 from benchmarks.lib.fan_out import with_progress_bar
-from benchmarks.lib.outputs import new_folder, provenance_of, write_csv, write_json
+from benchmarks.lib.outputs import new_folder, provenance_of, write_json
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.measures import mean_error, settled
 from benchmarks.loop.scenarios import Arguments, PlantOptions
 from mptc_gym import PRESETS, Parameters
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from optuna.trial import FrozenTrial
 
 SEED = SEEDS["sampler"].first  # seed of Optuna's sampler in the first trial
 STARTUP = 200  # number of trials with random gains, before Optuna's sampler chooses gains
@@ -34,20 +34,18 @@ SPACING_OF_CASES = 100_000  # difference between the first seeds of two successi
 FINALISTS = 10  # number of best trials whose gains are scored again on new runs
 FINAL_RUNS = 1000  # number of new runs of each case
 FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first new run
-# Penalty for a run that does not settle, degC: the mean error of an idle valve if the set point
-# is 5 degC.
-PENALTY = 5.0
-# Controllers of the roster with the structure of the searched controller and other gains.
-PRESENT = {"nn": ["nn"], "pi": ["pi", "pi-searched"], "dahlin": ["dahlin"]}
-NOTE = (
-    "For each case, the table gives the median over the runs of the mean absolute error, in "
-    "°C. The column 'not converged' gives the share of runs that do not settle at the constant "
-    f"set point. The objective is the mean of the medians, plus {PENALTY:g} °C times this "
-    "share; if a plant has set points other than those of the paper's plant, the penalty is "
-    "scaled with the set points. The column 'in the search' gives the objective of the same "
-    "gains in the search. The last rows are the controllers that other commands run."
+NOTES = (
+    "The columns from 'constant' to 'learnt, slow' give the median over the runs of the mean "
+    "absolute error, in °C, in five cases: a constant set point; a square wave and a dead zone "
+    "that is 1.3 times as wide as that of the plant; a square wave and noise; and two square "
+    "waves of different periods whose first two periods do not count, so that a controller has "
+    "time to learn.",
+    "'not converged' is the share of runs that do not settle at the constant set point. "
+    "'objective', which the search minimises, is the mean of the five medians, plus 'not "
+    "converged' times the amplitude of the plant's set points, in °C. 'in the search' is the "
+    "objective of the same gains in the search. The last rows have the gains with which other "
+    "commands run the controller.",
 )
-PAPER = Parameters()  # the paper's plant
 PAPER_NOISE = PRESETS["noisy"]["noise_variance"]  # noise variance R of the paper, degC^2
 # Arguments of the environment for a plant without noise and load disturbance.
 QUIET: Arguments = {
@@ -61,25 +59,9 @@ QUIET: Arguments = {
 class TuningCase(NamedTuple):
     """A case on which a search for gains evaluates a controller."""
 
-    samples: int  # length of a run, samples
-    first: int  # number of the first sample that counts in the mean error
+    samples: int  # length of a run
+    first: int  # the first sample that counts in the mean error
     arguments: Arguments  # arguments of the environment
-
-
-# Cases on the paper's plant that are similar to the paper's cases, but not equal, so that gains
-# are not tuned to a published result. In the cases called "learnt", the errors count only after
-# a controller has had time to learn; in the other cases, the errors count from the start.
-CASES = {
-    "constant": TuningCase(600, 0, {"setpoint": 4.8}),
-    "dead zone": TuningCase(
-        1280, 0, {"setpoint_amplitude": 5.1, "setpoint_period": 640, "dead_zone": 6.5}
-    ),
-    "noise": TuningCase(
-        1040, 0, {"setpoint_amplitude": 4.9, "setpoint_period": 520, "noise_variance": 0.4}
-    ),
-    "learnt": TuningCase(2240, 1120, {"setpoint_amplitude": 5.2, "setpoint_period": 560}),
-    "learnt, slow": TuningCase(1920, 1280, {"setpoint_amplitude": 5.4, "setpoint_period": 640}),
-}
 
 
 @options
@@ -93,7 +75,7 @@ class Options:
     A search that was stopped goes on, to the same result, if --out names its folder.
     """
 
-    controller: Annotated[str, Parameter(choices=PRESENT)] = field(kw_only=False)
+    controller: Annotated[str, Parameter(choices=SPANS)] = field(kw_only=False)
     """Name of the controller whose gains to search."""
     trials: Count = 800
     """Number of sets of gains to try, with those of a search that goes on."""
@@ -104,26 +86,27 @@ class Options:
 def work(options: Options) -> None:
     """Search for gains, write the results, and print the best gains."""
     import optuna  # here, so that no folder is made if Optuna is missing
+    import pandas as pd
 
     from benchmarks.lib.report import Section, show, write_report
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = options.controller
     plant = options.plant.arguments()
-    try:
-        spans = ROSTER[name].spans(KnownPlant(Parameters(**plant)))  # type: ignore[misc]
-    except ValueError as error:
-        raise CommandError(f"--plant: {error}") from error
+    spans = spans_for(name, KnownPlant(Parameters(**plant)))
     provenance = provenance_of(seeds={"sampler": SEED, "runs": FIRST_RUN})
     folder = new_folder(options.out, f"tune-{name}", provenance, goes_on=True)
-    trials = search(name, plant, spans, options.trials, folder)
-    write_csv(folder / "trials.csv", trials)
-    finalists = finals(name, plant, list(spans), trials)
+    try:
+        trials = search(name, plant, spans, options.trials, folder)
+        rows = finals(name, plant, spans, trials)
+    except KeyboardInterrupt as error:
+        advice = f"interrupted; with --out {folder}, the same command goes on"
+        raise CommandError(advice, status=130) from error
     samples = len(trials) * RUNS * sum(case.samples for case in cases(plant).values())
     budget = f"{len(trials)} trials: {samples / 1e6:.3g} M samples"
     content = {
         "controller": name,
-        "gains": finalists.loc[0, list(spans)].to_dict(),
+        "gains": {gain: rows[0][gain] for gain in spans},
         "plant": plant,
         # A text for the column "prior knowledge" of the reports of `benchmarks.compare`.
         "knows": "gains of a search on this plant",
@@ -131,21 +114,23 @@ def work(options: Options) -> None:
     }
     write_json(folder / "gains.json", content)
     title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS:,} new runs"
-    texts = finalists.map(lambda cell: cell if isinstance(cell, str) else f"{cell:.4g}")
-    best = Section(title, [NOTE], texts.replace("nan", ""))
+    table = pd.DataFrame(rows).map(lambda x: x if isinstance(x, str) else f"{x:.4g}")
+    best = Section(title, NOTES, table)
     write_report(folder, f"Gains: {ROSTER[name].label}", [best], provenance)
     show(best)
     words = ["--agent", f"my-{name}={folder}/gains.json", *options.plant.words]
     print(f"To run the best gains: python -m benchmarks.compare {shlex.join(words)}")
 
 
-def finals(name: str, plant: Arguments, gains: list[str], trials: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of the scores of the best `FINALISTS` trials on new runs, best first.
+def finals(
+    name: str, plant: Arguments, spans: Spans, trials: Sequence[FrozenTrial]
+) -> list[dict[str, Any]]:
+    """Return a row for each of the best `FINALISTS` trials, scored on new runs, best first.
 
     New runs are necessary because the best result of many trials is partly luck. The gains of
-    the best trials are rounded to three digits before the new runs. A row has the numbers that
-    `score` returns for the new runs, and "in the search", the objective of the gains before
-    rounding in the search, degC. Rows of the controllers in `PRESENT` follow.
+    the best trials are rounded to three digits before the new runs. A row has the gains, the
+    numbers that `score` returns for the new runs, and "in the search", the objective of the
+    gains before rounding in the search, degC. Rows with the gains of other commands follow.
 
     Parameters
     ----------
@@ -153,75 +138,84 @@ def finals(name: str, plant: Arguments, gains: list[str], trials: pd.DataFrame) 
         Name of the controller.
     plant
         Arguments of the environment for the plant.
-    gains
-        Names of the gains.
+    spans
+        Interval in which gains were searched, by the gain's name.
     trials
-        The table that `search` returns.
+        Trials of the search.
     """
-    import pandas as pd
-
-    best = trials.nsmallest(FINALISTS, "objective")
-    rounded: Any = best[gains].map(lambda gain: float(f"{gain:.3g}")).to_dict("records")
-    rows = [score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, finalist) for finalist in rounded]
-    table = pd.DataFrame(rows)
-    table["in the search"] = best["objective"].to_numpy()
-    table = table.sort_values("objective")
-    table.insert(0, "gains", "of the search")
-    present = []
-    for other in PRESENT[name]:
-        controller, _ = ROSTER[other].start(plant, 1, 0)
-        values = {gain: getattr(controller, gain) for gain in gains}
-        row = score(name, plant, FINAL_RUNS, FINAL_FIRST_RUN, values)
-        present.append({"gains": f"of {ROSTER[other].label}", **row})
-    return pd.concat([table, pd.DataFrame(present)], ignore_index=True)
+    rows: list[dict[str, Any]] = []
+    for trial in sorted(trials, key=lambda trial: float(trial.value or 0.0))[:FINALISTS]:
+        gains = gains_of(trial.params, spans)
+        rounded = {gain: float(f"{value:.3g}") for gain, value in gains.items()}
+        scores = score(name, plant, rounded, FINAL_RUNS, FINAL_FIRST_RUN)
+        row = {"gains": "of the search", **rounded, **scores, "in the search": trial.value}
+        rows.append(row)
+    rows.sort(key=lambda row: row["objective"])
+    for spec in ROSTER.values():
+        if (
+            spec.make is ROSTER[name].make
+        ):  # the same controller, such as "pi-searched" for "pi"
+            controller, _ = spec.start(plant, 1, 0)
+            gains = {gain: getattr(controller, gain) for gain in spans}
+            scores = score(name, plant, gains, FINAL_RUNS, FINAL_FIRST_RUN)
+            row = {"gains": f"of {spec.label}", **gains, **scores, "in the search": ""}
+            rows.append(row)
+    return rows
 
 
 def cases(plant: Arguments) -> dict[str, TuningCase]:
-    """Return the cases of a search for gains, by name: `CASES`, scaled to the plant.
+    """Return the cases of a search for gains on a plant, by name.
 
-    The set points are scaled in proportion to `setpoint_amplitude`, the lengths of the runs in
-    proportion to `setpoint_period`, and the dead zone and the noise variance in proportion to
-    the values of the plant. In the case "noise", even a plant without noise gets some noise. In
-    the case "constant", the plant has neither noise nor load, so that every good control loop
-    can settle.
+    On the paper's plant, the cases are similar to the paper's cases, but not equal, so that
+    gains are not tuned to a published result. In the cases called "learnt", the errors count
+    only after a controller has had time to learn. In the case "constant", the plant has neither
+    noise nor load, so that every good control loop can settle.
+
+    For other plants, the set points are scaled in proportion to `setpoint_amplitude`, the
+    lengths of the runs in proportion to `setpoint_period`, and the dead zone and the noise
+    variance in proportion to the values of the plant. In the case "noise", even a plant without
+    noise gets some noise.
     """
-    known, paper = KnownPlant(Parameters(**plant)), KnownPlant(PAPER)
-    duration = known.parameters.setpoint_period / PAPER.setpoint_period
+    known = KnownPlant(Parameters(**plant))
+    # Factors that are 1 for the paper's plant.
+    amplitude = known.parameters.setpoint_amplitude / PAPER.parameters.setpoint_amplitude
+    duration = known.parameters.setpoint_period / PAPER.parameters.setpoint_period
+    dead_zone = known.dead_zone / PAPER.dead_zone
     noise = float(known.model.numbers.noise_variance) / PAPER_NOISE
     if noise == 0.0:  # The noise variance is scaled with the square of temperature changes.
-        noise = (known.temperature_range / paper.temperature_range) ** 2
-    amplitude = amplitude_of(plant)
-    factors = {
-        "setpoint": amplitude,
-        "setpoint_amplitude": amplitude,
-        "setpoint_period": duration,
-        "dead_zone": known.dead_zone / paper.dead_zone,
-        "noise_variance": noise,
+        noise = (known.temperature_range / PAPER.temperature_range) ** 2
+
+    def square(
+        samples: int, first: int, level: float, period: int, **changes: float
+    ) -> TuningCase:
+        """Return the case of a square wave, whose period is an even number of samples."""
+        arguments = {
+            **plant,
+            "setpoint": "square",
+            "setpoint_amplitude": level * amplitude,
+            "setpoint_period": max(2, 2 * round(period * duration / 2)),
+            **changes,
+        }
+        return TuningCase(round(samples * duration), round(first * duration), arguments)
+
+    constant = {**plant, **QUIET, "setpoint": 4.8 * amplitude}
+    return {
+        "constant": TuningCase(round(600 * duration), 0, constant),
+        "dead zone": square(1280, 0, 5.1, 640, dead_zone=6.5 * dead_zone),
+        "noise": square(1040, 0, 4.9, 520, noise_variance=0.4 * noise),
+        "learnt": square(2240, 1120, 5.2, 560),
+        "learnt, slow": square(1920, 1280, 5.4, 640),
     }
-    scaled_cases: dict[str, TuningCase] = {}
-    for name, case in CASES.items():
-        scaled = {key: factors[key] * value for key, value in case.arguments.items()}
-        if "setpoint_period" in scaled:  # The period must be an even number of samples.
-            scaled["setpoint_period"] = max(2, 2 * round(scaled["setpoint_period"] / 2))
-        if name == "constant":
-            scaled |= QUIET
-        arguments = {**plant, "setpoint": "square", **scaled}
-        lengths = round(duration * case.samples), round(duration * case.first)
-        scaled_cases[name] = TuningCase(*lengths, arguments)
-    return scaled_cases
 
 
-def amplitude_of(plant: Arguments) -> float:
-    """Return the amplitude of a plant's set points as a multiple of that of the paper's."""
-    return Parameters(**plant).setpoint_amplitude / PAPER.setpoint_amplitude
+def search(
+    name: str, plant: Arguments, spans: Spans, count: int, folder: Path
+) -> list[FrozenTrial]:
+    """Try `count` sets of gains of a controller, and return the trials.
 
-
-def search(name: str, plant: Arguments, spans: Spans, count: int, folder: Path) -> pd.DataFrame:
-    """Try `count` sets of gains of a controller, and return a table of the results of `score`.
-
-    The trials are stored in `folder`, trial by trial. A search that starts again goes on after
-    the stored trials of the same controller and plant, and tries the gains that it would have
-    tried without an interruption.
+    Optuna stores the trials in `folder`, trial by trial. A search that starts again goes on
+    after the stored trials of the same controller and plant, and tries the gains that it would
+    have tried without an interruption.
 
     Parameters
     ----------
@@ -237,7 +231,6 @@ def search(name: str, plant: Arguments, spans: Spans, count: int, folder: Path) 
         Folder of the results.
     """
     import optuna
-    import pandas as pd
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend
 
@@ -260,29 +253,28 @@ def search(name: str, plant: Arguments, spans: Spans, count: int, folder: Path) 
             seed=SEED + i, n_startup_trials=STARTUP, multivariate=True, constant_liar=False
         )
         trial = study.ask(magnitudes)
-        gains = {}
-        for gain, magnitude in trial.params.items():
-            gains[gain] = math.copysign(magnitude, spans[gain][0])
-        row = score(name, plant, RUNS, FIRST_RUN, gains)
-        trial.set_user_attr("row", row)
-        study.tell(trial, row["objective"])
-    return pd.DataFrame(
-        [trial.user_attrs["row"] for trial in study.get_trials(states=is_complete)]
-    )
+        scores = score(name, plant, gains_of(trial.params, spans), RUNS, FIRST_RUN)
+        study.tell(trial, scores["objective"])
+    return study.get_trials(states=is_complete)
+
+
+def gains_of(magnitudes: Mapping[str, float], spans: Spans) -> dict[str, float]:
+    """Return the gains of a trial, which have the signs of `spans`, from their magnitudes."""
+    return {gain: math.copysign(magnitudes[gain], ends[0]) for gain, ends in spans.items()}
 
 
 def score(
-    name: str, plant: Arguments, runs: int, first_run: int, gains: Mapping[str, float]
+    name: str, plant: Arguments, gains: Mapping[str, float], runs: int, first_run: int
 ) -> dict[str, float]:
     """Run a controller with the gains `gains` in all cases, and return the results by name.
 
     The results contain:
 
-    - the gains;
     - the median over the runs of the mean error in each case, degC, by the name of the case;
     - "not converged": the share of runs that do not settle at the constant set point;
-    - "objective": the mean of the medians over the cases, plus a penalty in proportion to "not
-      converged", degC. The search minimises the objective.
+    - "objective": the mean of the medians over the cases, plus the product of "not converged"
+      and the amplitude of the plant's set points, degC, which is the mean error of an idle
+      valve. The search minimises the objective.
 
     Parameters
     ----------
@@ -290,12 +282,12 @@ def score(
         Name of the controller.
     plant
         Arguments of the environment for the plant.
+    gains
+        The gains by name.
     runs
         Number of runs of each case.
     first_run
         Seed of the first run of the first case.
-    gains
-        The gains by name.
     """
     controller = replace(ROSTER[name], arguments=gains)
     medians: dict[str, float] = {}
@@ -306,9 +298,9 @@ def score(
         medians[case_name] = float(np.median(mean_error(trajectory[case.first :])))
         if case_name == "constant":
             unsettled = 1.0 - float(settled(trajectory).mean())
-    penalty = PENALTY * amplitude_of(plant)
-    objective = float(np.mean(list(medians.values()))) + penalty * unsettled
-    return {**gains, **medians, "not converged": unsettled, "objective": objective}
+    penalty = unsettled * Parameters(**plant).setpoint_amplitude
+    objective = float(np.mean(list(medians.values()))) + penalty
+    return {**medians, "not converged": unsettled, "objective": objective}
 
 
 main = command("tune", Options, work)

@@ -76,7 +76,7 @@ REFUSED = {
         (["--device", "toaster"], "--device: Expected one of cpu, cuda"),
     ],
     "tune": [
-        (["pi", "--set", "b=[0.1,-0.1]"], "--plant: a search for gains needs a stable plant"),
+        (["pi", "--set", "b=[0.1,-0.1]"], "a search for gains needs a stable plant"),
     ],
     "train": [
         (["ppo-hard", "--set", "delay=9"], "--plant, --preset and --set are for ppo, not for"),

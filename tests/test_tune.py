@@ -4,7 +4,6 @@ import json
 import re
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from agents import DirectNNController
@@ -13,42 +12,11 @@ from benchmarks import tune
 from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.controllers.spans import NN_SPANS, PI_SPANS
+from benchmarks.controllers.spans import PAPER, SPANS
 from benchmarks.lib.command import CommandError
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import Parameters
 from tests.conftest import ROOT
-
-
-def test_cases_are_met_by_no_comparison():
-    compared = [case.arguments for case in SCENARIOS.values()]
-    assert not any(case.arguments in compared for case in tune.CASES.values())
-
-
-def test_no_control_pays_for_not_settling():
-    row = tune.score("pi", {}, 2, 0, {"kp": 0.0, "ki": 0.0})
-    assert row["constant"] == pytest.approx(4.8)  # all of the set point, all the time
-    assert row["learnt"] == pytest.approx(5.2)
-    assert row["not converged"] == 1.0
-    assert row["objective"] == pytest.approx(np.mean([row[c] for c in tune.CASES]) + 5.0)
-
-
-@pytest.fixture
-def short(monkeypatch):
-    """Make runs and finals short, and let the sampler learn soon."""
-    monkeypatch.setattr(tune, "FINALISTS", 2)
-    monkeypatch.setattr(tune, "STARTUP", 4)
-    monkeypatch.setattr(tune, "FINAL_RUNS", 3)
-    monkeypatch.setattr(tune, "RUNS", 2)
-    for name, case in tune.CASES.items():
-        monkeypatch.setitem(tune.CASES, name, case._replace(samples=60, first=0))
-
-
-def search(out, plant=""):
-    """Run a search, and return its trials."""
-    assert tune.main(f"pi --trials 6 --out {out} {plant}".split()) == 0
-    return pd.read_csv(out / "trials.csv")
-
 
 PLANT = {
     "b": [0.0912, 0.00808], "setpoint_amplitude": 10.0, "dead_zone": 3.0, "u_max": 20.0,
@@ -56,65 +24,114 @@ PLANT = {
 }  # fmt: skip
 
 
+def test_cases_are_met_by_no_comparison():
+    compared = [case.parameters for case in SCENARIOS.values()]
+    assert not any(Parameters(**case.arguments) in compared for case in tune.cases({}).values())
+
+
 def test_cases_scale_with_the_plant():
-    for name, case in tune.cases({}).items():
-        assert Parameters(**case.arguments) == Parameters(**tune.CASES[name].arguments)
     cases = tune.cases(PLANT)
     learnt, quiet = (Parameters(**cases[name].arguments) for name in ("learnt", "constant"))
     assert (learnt.setpoint_amplitude, learnt.setpoint_period) == (10.4, 280)
     assert learnt.disturbance_amplitude == 2.0
     assert (quiet.setpoint, quiet.noise_variance, quiet.is_disturbed) == (9.6, 0.0, False)
-    assert cases["learnt"].samples == 1120
+    assert cases["learnt"][:2] == (1120, 560)
     assert cases["dead zone"].arguments["dead_zone"] == pytest.approx(3.9)
     assert cases["noise"].arguments["noise_variance"] == pytest.approx(0.8)
 
 
-def test_gains_searched_on_a_plant_are_run_by_compare(short, tmp_path, capsys):
-    plant = tmp_path / "plant.json"
-    plant.write_text(json.dumps({"b": [0.0456, 0.00404]}))
-    chosen = f"--plant {plant} --set dead_zone=5.0"
-    assert tune.main(f"pi --trials 3 {chosen} --out {tmp_path}/pi".split()) == 0
-    assert capsys.readouterr().out.strip().endswith(f"my-pi={tmp_path}/pi/gains.json {chosen}")
-    file = tmp_path / "pi/gains.json"
-    gains = json.loads(file.read_text())["gains"]
-    assert gains["kp"] < 0.0
-    (spec,) = own_controllers([f"mine={file}"]).values()
-    assert spec.direction == 1
-    controller, _ = spec.start({"b": [0.0456, 0.00404]}, 1, 0)
-    assert (controller.kp, controller.ki) == (gains["kp"], gains["ki"])
-    file.write_text('{"controller": "pi"}')
-    with pytest.raises(CommandError, match=r"--agent: mine=.* must be .*: 'gains'"):
-        own_controllers([f"mine={file}"])
+def test_no_control_pays_for_not_settling():
+    scores = tune.score("pi", {}, {"kp": 0.0, "ki": 0.0}, 2, 0)
+    assert scores["constant"] == pytest.approx(4.8)  # all of the set point, all the time
+    assert scores["learnt"] == pytest.approx(5.2)
+    assert scores["not converged"] == 1.0
+    medians = [scores[name] for name in tune.cases({})]
+    assert scores["objective"] == pytest.approx(np.mean(medians) + 5.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "gain", "of_paper", "of_plant"),
+    [("pi", "kp", (0.1, 10.0), (-0.05, -5.0)), ("nn", "weight_scale", *[(0.05, 2.0)] * 2)],
+)
+def test_spans_scale_with_the_plant(name, gain, of_paper, of_plant):
+    # Twice the gain, of the other sign: half the gains of a controller, likewise.
+    for plant, span in ((PAPER, of_paper), (KnownPlant(Parameters(**PLANT)), of_plant)):
+        assert SPANS[name](plant)[gain] == pytest.approx(span)
+
+
+def test_the_pages_of_the_searches_name_the_gains_of_other_commands():
+    paper = DirectNNController()
+    gains = {"nn": [getattr(paper, name) for name in SPANS["nn"](PAPER)]}
+    gains["pi"] = [*SEARCHED_GAINS.values()]
+    for name, values in gains.items():
+        page = (ROOT / f"benchmarks/published/tune_{name}.md").read_text(encoding="utf-8")
+        assert {f"{value:g}" for value in values} <= set(re.findall(r"\d+(?:\.\d+)?", page))
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Make runs and finals short, and let the sampler learn soon."""
+    for name, value in {"FINALISTS": 2, "STARTUP": 4, "FINAL_RUNS": 3, "RUNS": 2}.items():
+        monkeypatch.setattr(tune, name, value)
+    cases = tune.cases
+    monkeypatch.setattr(
+        tune,
+        "cases",
+        lambda plant: {
+            name: case._replace(samples=60, first=0) for name, case in cases(plant).items()
+        },
+    )
+
+
+def gains_in(folder):
+    return json.loads((folder / "gains.json").read_text())["gains"]
 
 
 @pytest.mark.usefixtures("short")
 class TestSearch:
-    def test_finalists_are_judged_rounded_on_new_runs(self, tmp_path, capsys):
-        trials = search(tmp_path / "search")
-        assert len(trials) == 6
-        assert trials["kp"].between(*PI_SPANS["kp"]).all()
-        assert "The best" in capsys.readouterr().out
-        table = tune.finals("pi", {}, ["kp", "ki"], trials)
-        assert [*table["gains"]] == [
-            *["of the search"] * 2, "of PI (1992)", "of PI (searched)",
-        ]  # fmt: skip
-        assert table.loc[2:, ["kp", "ki"]].to_numpy().tolist() == [
-            [2.2, 0.3], [*SEARCHED_GAINS.values()],
-        ]  # fmt: skip
-        for row in table.itertuples():
-            gains = {"kp": row.kp, "ki": row.ki}
-            new_runs = tune.score("pi", {}, 3, tune.FINAL_FIRST_RUN, gains)
-            assert row.objective == new_runs["objective"]
-        best = trials.nsmallest(2, "objective").sort_values("kp")
-        finalists = table[:2].sort_values("kp")
-        assert [*finalists["in the search"]] == pytest.approx([*best["objective"]])
-        assert [*finalists["kp"]] == [float(f"{kp:.3g}") for kp in best["kp"]]
-        assert table["objective"][:2].is_monotonic_increasing
-        written = json.loads((tmp_path / "search/gains.json").read_text())["gains"]
-        assert written == table.loc[0, ["kp", "ki"]].to_dict()
+    def test_gains_searched_on_a_plant_are_run_by_compare(self, tmp_path, capsys):
+        plant = tmp_path / "plant.json"
+        plant.write_text(json.dumps({"b": [0.0456, 0.00404]}))
+        chosen = f"--plant {plant} --set dead_zone=5.0"
+        assert tune.main(f"pi --trials 3 {chosen} --out {tmp_path}/pi".split()) == 0
+        file = tmp_path / "pi/gains.json"
+        assert capsys.readouterr().out.strip().endswith(f"my-pi={file} {chosen}")
+        (spec,) = own_controllers([f"mine={file}"]).values()
+        assert spec.direction == 1
+        controller, _ = spec.start({"b": [0.0456, 0.00404]}, 1, 0)
+        assert {"kp": controller.kp, "ki": controller.ki} == gains_in(tmp_path / "pi")
+        assert controller.kp < 0.0
+        file.write_text('{"controller": "pi"}')
+        with pytest.raises(CommandError, match=r"--agent: mine=.* must be .*: 'gains'"):
+            own_controllers([f"mine={file}"])
 
-    def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch):
-        uninterrupted, score, calls = search(tmp_path / "whole"), tune.score, []
+    @pytest.mark.parametrize("name", SPANS)
+    def test_finalists_are_judged_rounded_on_new_runs_beside_present_gains(
+        self, name, tmp_path
+    ):
+        spans = SPANS[name](PAPER)
+        trials = tune.search(name, {}, spans, 5, tmp_path)
+        best = sorted(trials, key=lambda trial: trial.value)[:2]
+        first, second, *others = tune.finals(name, {}, spans, trials)
+        assert first["objective"] <= second["objective"]
+        for row in (first, second):
+            gains = {gain: row[gain] for gain in spans}
+            (trial,) = [trial for trial in best if trial.value == row["in the search"]]
+            assert gains == {gain: float(f"{trial.params[gain]:.3g}") for gain in spans}
+            new_runs = tune.score(name, {}, gains, 3, tune.FINAL_FIRST_RUN)
+            assert row["objective"] == new_runs["objective"]
+        controllers = [name, "pi-searched"] if name == "pi" else [name]
+        case = tune.cases({})["dead zone"]
+        for row, present in zip(others, controllers, strict=True):
+            seed = tune.FINAL_FIRST_RUN + tune.SPACING_OF_CASES
+            trajectory = ROSTER[present].run(case.arguments, case.samples, 3, seed)
+            median = np.median(tune.mean_error(trajectory))
+            assert row["dead zone"] == pytest.approx(median, rel=1e-12)
+
+    def test_a_stopped_search_goes_on_where_it_was(self, tmp_path, monkeypatch, capsys):
+        whole, parts = tmp_path / "whole", tmp_path / "parts"
+        assert tune.main(f"pi --trials 6 --out {whole}".split()) == 0
+        score, calls = tune.score, []
 
         def score_or_stop(*arguments):
             calls.append(arguments)
@@ -123,43 +140,15 @@ class TestSearch:
             return score(*arguments)
 
         monkeypatch.setattr(tune, "score", score_or_stop)
-        out = tmp_path / "parts"
-        assert tune.main(f"pi --trials 6 --out {out}".split()) == 130
-        calls *= 2  # 10 calls: no further stop
-        search(out, "--set delay=3")  # A search on another plant has no influence.
+        words = f"pi --trials 6 --out {parts}".split()
+        assert tune.main(words) == 130
+        assert f"with --out {parts}, the same command goes on" in capsys.readouterr().err
+        # A search on another plant has no influence.
+        assert tune.main([*words, "--set", "delay=3"]) == 0
         before = len(calls)
-        assert search(out).equals(uninterrupted)
+        assert tune.main(words) == 0
         assert len(calls) == before + 2 + 2 + 2  # 4 are kept; then 2 finalists, 2 present gains
-
-
-def test_the_pages_of_the_searches_name_the_gains_of_other_commands():
-    paper = DirectNNController()
-    gains = {"nn": [getattr(paper, name) for name in NN_SPANS], "pi": SEARCHED_GAINS.values()}
-    for name, values in gains.items():
-        page = (ROOT / f"benchmarks/published/tune_{name}.md").read_text(encoding="utf-8")
-        assert {f"{value:g}" for value in values} <= set(re.findall(r"\d+(?:\.\d+)?", page))
-
-
-@pytest.mark.usefixtures("short")
-@pytest.mark.parametrize("name", tune.PRESENT)
-def test_the_present_gains_are_those_of_the_controllers_themselves(name):
-    spans = ROSTER[name].spans(KnownPlant(Parameters()))
-    middle = {gain: sum(span) / 2 for gain, span in spans.items()}
-    trials = pd.DataFrame([tune.score(name, {}, 2, 0, middle)])
-    table = tune.finals(name, {}, list(spans), trials).iloc[1:]
-    case = tune.cases({})["dead zone"]
-    for other, median in zip(tune.PRESENT[name], table["dead zone"], strict=True):
-        seed = tune.FINAL_FIRST_RUN + tune.SPACING_OF_CASES
-        trajectory = ROSTER[other].run(case.arguments, case.samples, 3, seed)
-        assert median == pytest.approx(np.median(tune.mean_error(trajectory)), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("name", "gain", "span"), [("pi", "kp", (-0.05, -5.0)), ("nn", "weight_scale", (0.05, 2.0))]
-)
-def test_spans_scale_with_the_plant(name, gain, span):
-    spans = ROSTER[name].spans
-    assert spans(KnownPlant(Parameters())) == {"pi": PI_SPANS, "nn": NN_SPANS}[name]
-    # Twice the gain, of the other sign: half the gains of a controller, likewise.
-    twice = KnownPlant(Parameters(**PLANT))
-    assert spans(twice)[gain] == pytest.approx(span)
+        assert gains_in(parts) == gains_in(whole)
+        stored = [tune.search("pi", {}, SPANS["pi"](PAPER), 6, out) for out in (whole, parts)]
+        gains, same_gains = ([trial.params for trial in trials] for trials in stored)
+        assert gains == same_gains

@@ -2,8 +2,7 @@
 
 The function of a controller takes a `KnownPlant` and shows what the controller knows: the
 controller knows what its function takes from the plant. The command `compare` can run each
-controller of `ROSTER`. The command `tune` can search the gains of each controller whose record
-has `spans`.
+controller of `ROSTER`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +22,6 @@ from agents.networks import PRETRAINED
 from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.controllers.spans import Spans, dahlin_spans, nn_spans, pi_spans
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.measures import Agent, IdleValve, Trajectory, make_plants, rollout
 from mptc_gym import Parameters
@@ -71,9 +69,6 @@ class ControllerSpec:
         Whether the controller draws random numbers, such as initial weights.
     learns : bool
         Whether the controller goes on learning from one run to the next.
-    spans : callable, optional
-        Function that takes a `KnownPlant`, and returns the interval in which a search looks for
-        each gain.
     compared : bool
         Whether the command `compare` runs the controller by default.
     """
@@ -89,7 +84,6 @@ class ControllerSpec:
     direction: int | None = None
     random: bool = False
     learns: bool = False
-    spans: Callable[[KnownPlant], Spans] | None = None
     compared: bool = True
 
     def members(self) -> "list[ControllerSpec]":
@@ -281,7 +275,6 @@ _SPECS = (
         "present search takes 800 trials: 566 M samples, 6 min",
         random=True,
         learns=True,
-        spans=nn_spans,
     ),
     ControllerSpec(
         name="pi",
@@ -291,7 +284,6 @@ _SPECS = (
         knows="gains of the paper, for its plant",
         searched="2 gains; the paper does not say how they were found",
         direction=-1,
-        spans=pi_spans,
     ),
     ControllerSpec(
         name="pi-simc",
@@ -327,7 +319,6 @@ _SPECS = (
         make=dahlin,
         knows=_KNOWS_DATA_SHEET,
         searched=f"{_TUNING_RULE}; closed-loop time constant by hand: a tenth of the plant's",
-        spans=dahlin_spans,
     ),
     ControllerSpec(
         name="self-tuning",
