@@ -56,4 +56,5 @@ def on_page_content(html: str, **_: object) -> str:
     html = html.replace("<p>::</p>\n", "")  # before literal blocks in docstrings
     # The environment's docstring gets the table of its arguments when it is imported.
     html = html.replace("<p><arguments></p>", ARGUMENTS)
-    return html.replace('href="README.md"', 'href="../"')  # in the notebook
+    # In the notebook.
+    return html.replace('href="train_your_own.md"', 'href="../train_your_own/"')
