@@ -4,16 +4,17 @@ import copy
 import pickle
 import re
 
-import gymnasium
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
 
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop.measures import make_plants, mean_error, rollout
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
+from mptc_gym.sb3 import make_vec_env
 from tests.conftest import ROOT
 from tests.verify_bounds import errors
 
@@ -162,23 +163,26 @@ class TestOwnControllers:
             errors(member, 3, 1200, **PRESETS["noisy"]), expected.errors, rtol=0, atol=1e-12
         )
 
-    def test_a_zip_of_stable_baselines3_enters_by_the_lines_of_the_page(
-        self, written, tmp_path, monkeypatch
+    @pytest.mark.parametrize("factory", ["ppo", "ppo_normalised"])
+    def test_a_model_of_stable_baselines3_enters_by_the_lines_of_the_page(
+        self, factory, written, tmp_path, monkeypatch
     ):
         interface = {
             "action": "change", "max_move": 2.0, "error_window": 8, "action_window": 30
         }  # fmt: skip
-        env = gymnasium.make("MiddlePoint-v0", **interface)
-        model = PPO("MlpPolicy", env, seed=0, device="cpu")
+        env = make_vec_env("MiddlePointNoisy-v0", 4, **interface)
         (tmp_path / "best").mkdir()
+        if factory == "ppo_normalised":
+            env = VecNormalize(env)
+        model = PPO("MlpPolicy", env, n_steps=16, batch_size=64, seed=0, device="cpu").learn(1)
         model.save(tmp_path / "best/best_model.zip")
+        if factory == "ppo_normalised":
+            env.save(tmp_path / "best/vecnormalize.pkl")
         page = (ROOT / "benchmarks/examples/train_your_own.md").read_text(encoding="utf-8")
-        (code,) = re.findall(
-            r"```python\n(from stable_baselines3 import PPO\n\n\ndef.*?)```", page, re.DOTALL
-        )
+        (code,) = re.findall(r"```python\n([^`]*def ppo[^`]*)```", page)
         monkeypatch.chdir(tmp_path)
-        (member,) = members_of(written(code.replace("def ppo", "def Mine")))
-        expected = evaluate(model, IDS["noisy"], episodes=3, **interface)
+        (member,) = members_of(written(f"{code}\nMine = {factory}\n"))
+        expected = evaluate(model, IDS["noisy"], episodes=3)
         np.testing.assert_allclose(
             errors(member, 3, 1200, **PRESETS["noisy"]), expected.errors, rtol=0, atol=1e-9
         )
