@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.controllers.known_plant import KnownPlant
+from benchmarks.controllers.known_plant import PAPER, KnownPlant
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.controllers.spans import PAPER, SPANS, Spans, spans_for
+from benchmarks.controllers.spans import SPANS, Spans, spans_for
 from benchmarks.lib.command import CommandError, Count, Folder, Parameter, command, options
 from benchmarks.lib.fan_out import with_progress_bar
 from benchmarks.lib.outputs import new_folder, provenance_of, write_json

@@ -38,22 +38,23 @@ def small(monkeypatch):
         monkeypatch.setitem(sb3.SETTINGS, name, value)
 
 
-def test_the_command_trains_what_is_missing_and_lists_all_by_their_seeds(
+def test_the_command_trains_what_is_missing_for_a_plant_on_which_compare_runs_it(
     tmp_path, capsys, monkeypatch
 ):
-    short = {
-        "plants": (ppo.TrainingPlants(64, {}),),
-        "cases": {"short": {"max_episode_steps": 20}},
-    }
-    monkeypatch.setitem(ppo.RECIPES, "ppo", replace(ppo.RECIPES["ppo"], **short))
-    words = f"ppo --steps 8 --jobs 1 --out {tmp_path}".split()
-    assert program.main([*words, "--networks", "1"]) == 0
-    first = tmp_path / "ppo-10000.npz"
-    written = first.stat().st_mtime_ns
-    assert program.main([*words, "--networks", "2"]) == 0
-    assert first.stat().st_mtime_ns == written
+    few = replace(ppo.RECIPES["ppo"], plants=(ppo.TrainingPlants(8, {}),) * 2)
+    monkeypatch.setitem(ppo.RECIPES, "ppo", few)
+    words = f"ppo --steps 8 --jobs 1 --set b=[0.0456,0.00404] --set u_max=12 --out {tmp_path}"
+    files = [tmp_path / f"ppo-plant-{seed}.npz" for seed in (10_000, 10_001)]
+    assert program.main([*words.split(), "--networks", "1"]) == 0
+    written = files[0].stat().st_mtime_ns
+    assert program.main([*words.split(), "--networks", "2"]) == 0
+    assert files[0].stat().st_mtime_ns == written
     assert {"10000", "10001"} <= set(capsys.readouterr().out.split())
-    assert {file.name for file in tmp_path.glob("*.npz")} == {"ppo-10000.npz", "ppo-10001.npz"}
+    (spec,) = own_controllers([f"mine={file}" for file in files]).values()
+    assert spec.direction == 1
+    rising = {"b": [0.0456, 0.00404], "u_max": 12.0}
+    first, second = (member.run(rising, 20, 1, 0).command for member in spec.members())
+    assert (first != second).any()
 
 
 def weights(network):
@@ -134,43 +135,30 @@ def test_those_of_the_project_are_of_the_recipes_and_the_search_is_that_of_its_l
     said = f"{len(trials)} trials: {samples:.0f} M samples, {minutes:.0f} min"
     assert ROSTER[name].searched.endswith(said)
     recipe = ppo.RECIPES[name]
-    asked = json.loads(json.dumps(asdict(recipe)))
+    settings = json.loads(json.dumps(asdict(recipe)))
+    assert settings.pop("plant") == {}
     files = [f"{name}-{seed}.npz" for seed in range(10_000, 10_005)]
     assert ROSTER[name].trainings == files
     for file in files:
         network = PolicyNetwork.load(PRETRAINED / file)
-        assert asked.items() <= network.provenance["recipe"].items()
+        assert settings.items() <= network.provenance["recipe"].items()
         count = sum(W.size for W, _ in network.layers)
         assert f"{count:,} weights" in ROSTER[name].searched
         assert f": {recipe.steps / 1e6:g} M samples a policy" in ROSTER[name].searched
 
 
-class TestOtherPlants:
-    PLANT = {"b": [0.0456, 0.00404], "setpoint_amplitude": 10.0, "dead_zone": 2.0}  # noqa: RUF012
-
-    def test_the_recipe_is_that_of_the_paper_plant_scaled(self):
-        recipe, paper = ppo.for_plant(self.PLANT), ppo.for_plant({})
-        assert [count for count, _ in recipe.plants] == [152, 360]
-        for _, arguments in recipe.plants:
-            assert arguments["b"] == self.PLANT["b"]
-            assert (arguments["setpoint"], arguments["setpoint_amplitude"]) == ("random", 12.0)
-        assert recipe.dead_zone == 2.0
-        # Of twice as large temperatures and the same flows, the inputs are the same.
-        observation = np.random.default_rng(0).normal(size=sum(recipe.windows.values()))
-        scaled = np.where(np.arange(observation.size) < 4 + recipe.memory, 2.0, 1.0)
-        np.testing.assert_allclose(
-            ppo.features(recipe) @ (scaled * observation), ppo.features(paper) @ observation
-        )
-        assert ppo.for_plant({}).plants == ppo.RECIPES["ppo"].plants
-
-    def test_what_is_trained_is_run_by_compare_on_this_plant(self, tmp_path, monkeypatch):
-        short = replace(ppo.RECIPES["ppo"], plants=(ppo.TrainingPlants(8, {}),) * 2)
-        monkeypatch.setitem(ppo.RECIPES, "ppo", short)
-        given = "ppo --networks 2 --steps 8 --jobs 1 --set b=[0.0456,0.00404] --set u_max=12"
-        assert program.main([*given.split(), "--out", str(tmp_path)]) == 0
-        files = sorted(tmp_path.glob("ppo-plant-*.npz"))
-        (spec,) = own_controllers([f"mine={file}" for file in files]).values()
-        assert spec.direction == 1
-        rising = {"b": [0.0456, 0.00404], "u_max": 12.0}
-        first, second = (member.run(rising, 20, 1, 0).command for member in spec.members())
-        assert (first != second).any()
+def test_the_recipe_for_another_plant_is_that_of_the_paper_plant_scaled():
+    plant = {"b": [0.0456, 0.00404], "setpoint_amplitude": 10.0, "dead_zone": 2.0}
+    recipe, paper = ppo.for_plant(plant), ppo.for_plant({})
+    assert [count for count, _ in recipe.plants] == [152, 360]
+    for _, arguments in recipe.plants:
+        assert arguments["b"] == plant["b"]
+        assert (arguments["setpoint"], arguments["setpoint_amplitude"]) == ("random", 12.0)
+    assert recipe.dead_zone == 2.0
+    # Of twice as large temperatures and the same flows, the inputs are the same.
+    observation = np.random.default_rng(0).normal(size=sum(recipe.windows.values()))
+    scaled = np.where(np.arange(observation.size) < 4 + recipe.memory, 2.0, 1.0)
+    np.testing.assert_allclose(
+        ppo.features(recipe) @ (scaled * observation), ppo.features(paper) @ observation
+    )
+    assert paper.plants == ppo.RECIPES["ppo"].plants

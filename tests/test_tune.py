@@ -9,10 +9,10 @@ import pytest
 from agents import DirectNNController
 from agents.pi import SEARCHED_GAINS
 from benchmarks import tune
-from benchmarks.controllers.known_plant import KnownPlant
+from benchmarks.controllers.known_plant import PAPER, KnownPlant
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.controllers.spans import PAPER, SPANS
+from benchmarks.controllers.spans import SPANS
 from benchmarks.lib.command import CommandError
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import Parameters

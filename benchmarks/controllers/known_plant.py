@@ -110,3 +110,6 @@ class KnownPlant:
         fastest = 0.1 * test["sampling_interval"]
         exact = time_constant_for(ROBUSTNESS, build, self.model, slowest, fastest)
         return build(float(f"{exact:.4g}"))
+
+
+PAPER = KnownPlant(Parameters())  # the paper's plant

@@ -6,13 +6,10 @@ Both ends of an interval have the same sign, and the first end has the smaller m
 import math
 from collections.abc import Callable, Mapping
 
-from benchmarks.controllers.known_plant import KnownPlant
+from benchmarks.controllers.known_plant import PAPER, KnownPlant
 from benchmarks.lib.command import CommandError
-from mptc_gym import Parameters
 
 Spans = Mapping[str, tuple[float, float]]  # an interval for each gain, by the name of the gain
-
-PAPER = KnownPlant(Parameters())
 
 
 def pi_spans(plant: KnownPlant) -> Spans:

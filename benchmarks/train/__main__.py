@@ -51,14 +51,11 @@ def work(options: Options) -> None:
     if name is None:
         raise CommandError(f"name the network to train: {', '.join(NETWORKS)}")
     recipe = ppo.RECIPES[name]
-    train = ppo.train
     stem = name  # beginning of the names of the files
     if options.plant.name:
         if name != "ppo":
             raise CommandError(f"--plant, --preset and --set are for ppo, not for {name}")
-        plant = options.plant.arguments()
-        recipe = ppo.for_plant(plant)
-        train = partial(train, plant=plant)
+        recipe = ppo.for_plant(options.plant.arguments())
         stem = "ppo-plant"
     if options.steps:
         recipe = replace(recipe, steps=options.steps)
@@ -66,7 +63,7 @@ def work(options: Options) -> None:
     folder = new_folder(options.out, f"train-{stem}", provenance_of(seeds=seeds), goes_on=True)
     files = {seed: folder / f"{stem}-{seed}.npz" for seed in seeds}
     tasks = {
-        file.name: partial(train, recipe, seed)
+        file.name: partial(ppo.train, recipe, seed)
         for seed, file in files.items()
         if not file.exists()
     }

@@ -7,7 +7,7 @@ training, and explains why the training is fast.
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple, NoReturn, cast
 
 import numpy as np
@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch import nn
 
 from agents import PolicyNetwork
-from benchmarks.controllers.known_plant import KnownPlant
+from benchmarks.controllers.known_plant import PAPER, KnownPlant
 from benchmarks.examples.sb3 import GROUP, SETTINGS, Exploration, inputs, make_ppo
 from benchmarks.lib.outputs import versions
 from benchmarks.lib.seeds import SEEDS
@@ -64,6 +64,8 @@ class Recipe:
     # Natural logarithm of the standard deviation of the action, at the start and at the end of
     # the training.
     log_std: tuple[float, float] = (-1.2, -3.5)
+    # Arguments of the environment for the plant to which `for_plant` has adapted the recipe.
+    plant: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def windows(self) -> dict[str, Any]:
@@ -77,16 +79,14 @@ class Recipe:
 
     @property
     def temperature_scale(self) -> float:
-        """The factor by which `for_plant` scaled temperatures; 1 for other recipes."""
-        # `for_plant` scales the reward's error in proportion to the amplitude.
-        error_scale: float = self.plants[0].arguments.get("error_scale", ERROR_SCALE)
-        return error_scale / ERROR_SCALE
+        """The plant's temperatures as a multiple of those of the paper's plant."""
+        amplitude: float = Parameters(**self.plant).setpoint_amplitude
+        return amplitude / PAPER.parameters.setpoint_amplitude
 
 
-# The error, degC, at which the reward is -1. With this scale, returns are of order 1, so that
-# the value function is learnt quickly.
-ERROR_SCALE = 50.0
-_COST = {"reward": "absolute", "error_scale": ERROR_SCALE}
+# An error of `error_scale`, degC, has the reward -1. With this scale, returns are of order 1,
+# so that the value function is learnt quickly.
+_COST: dict[str, Any] = {"reward": "absolute", "error_scale": 50.0}
 _RANDOM: dict[str, Any] = {**_COST, "setpoint": "random", "setpoint_amplitude": 6.0}
 _NOISE = 0.6  # noise variance of most training plants of the recipe `ppo`, degC^2
 # The square wave of the validation differs from that of the published results.
@@ -131,42 +131,37 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
     plant
         Arguments of the environment for the plant.
     """
-    parameters = Parameters(**plant)
-    paper = Parameters()
-    amplitude = parameters.setpoint_amplitude / paper.setpoint_amplitude
+    recipe = replace(RECIPES["ppo"], plant=plant)
+    scale = recipe.temperature_scale
+    known = KnownPlant(Parameters(**plant))
+    calm, noisy = recipe.plants
     training = {
         **plant,
-        "reward": "absolute",
-        "error_scale": ERROR_SCALE * amplitude,
-        "setpoint": "random",
-        "setpoint_amplitude": _RANDOM["setpoint_amplitude"] * amplitude,
+        **_RANDOM,
+        "error_scale": _COST["error_scale"] * scale,
+        "setpoint_amplitude": _RANDOM["setpoint_amplitude"] * scale,
     }
-    noisy = dict(training)
-    if parameters.range_of("noise_variance")[1] == 0.0:
-        paper_range = KnownPlant(paper).temperature_range
-        ratio = KnownPlant(parameters).temperature_range / paper_range
-        noisy["noise_variance"] = _NOISE * ratio**2
+    noise = {}
+    if known.parameters.range_of("noise_variance")[1] == 0.0:
+        ratio = known.temperature_range / PAPER.temperature_range
+        noise["noise_variance"] = _NOISE * ratio**2
     # A period of 500 samples for the paper's 600, and always an even number of samples.
-    half_period = max(1, round(parameters.setpoint_period * 500 / 1200))
+    half_period = max(1, round(known.parameters.setpoint_period * 500 / 1200))
     validation = {
         **plant,
         "setpoint": "square",
-        "setpoint_amplitude": _VALIDATION["setpoint_amplitude"] * amplitude,
+        "setpoint_amplitude": _VALIDATION["setpoint_amplitude"] * scale,
         "setpoint_period": 2 * half_period,
     }
-    calm_kind, noisy_kind = RECIPES["ppo"].plants
     return replace(
-        RECIPES["ppo"],
-        plants=(
-            TrainingPlants(calm_kind.number, training),
-            TrainingPlants(noisy_kind.number, noisy),
-        ),
+        recipe,
+        plants=(calm._replace(arguments=training), noisy._replace(arguments=training | noise)),
         cases={"plant": validation},
-        dead_zone=sum(parameters.range_of("dead_zone")) / 2.0,
+        dead_zone=known.dead_zone,
     )
 
 
-def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> PolicyNetwork:
+def train(recipe: Recipe, seed: int) -> PolicyNetwork:
     """Train a policy, and return it with validation results in the attribute `provenance`.
 
     Parameters
@@ -175,32 +170,27 @@ def train(recipe: Recipe, seed: int, plant: Mapping[str, Any] | None = None) -> 
         Settings of the training.
     seed
         Seed of the initial weights, the exploration and the plants.
-    plant
-        Arguments of the environment from which `for_plant` has made the recipe; None for a
-        recipe from `RECIPES`.
     """
     began = time.process_time()
     model = begin(recipe, seed)
     model.learn(recipe.steps, callback=Exploration(*recipe.log_std))
     seconds = time.process_time() - began
     policy = export(model, recipe)
-    if plant is not None:
-        policy = replace(policy, **KnownPlant(Parameters(**plant)).limits)
     validation = {}  # mean errors, degC
     for name, case in recipe.cases.items():
         result = evaluate(policy, seed=VALIDATION_SEED, **{**policy.interface, **case})
         validation[name] = result.mean_error
+    settings = asdict(recipe)
     policy.provenance = {
         "algorithm": "PPO of Stable-Baselines3",
-        "recipe": asdict(recipe) | SETTINGS,
+        "plant": settings.pop("plant"),
+        "recipe": settings | SETTINGS,
         "seed": seed,
         "steps": model.num_timesteps,
         "cpu_seconds": round(seconds, 1),
         "validation": validation,
         "versions": versions(),
     }
-    if plant is not None:
-        policy.provenance["plant"] = dict(plant)
     return policy
 
 
@@ -346,4 +336,5 @@ def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
         action="change",
         max_move=MAX_MOVE,
         compensated_dead_zone=recipe.dead_zone,
+        **KnownPlant(Parameters(**recipe.plant)).limits,
     )
