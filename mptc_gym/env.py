@@ -16,7 +16,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from mptc_gym.plant.checks import NOT_A_NUMBER, one_action, one_of, to_python
-from mptc_gym.plant.dynamics import Plant, WantedFlows, action_from_command
+from mptc_gym.plant.dynamics import Plant, WantedFlow, action_from_command
 from mptc_gym.plant.parameters import Parameters, full_signature, insert_table
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import ONLY_PLANT, Signals
@@ -289,9 +289,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         self._layout = tuple(np.cumsum(parameters.windows).tolist())
         self._has_more_info = parameters.is_disturbed or parameters.drifts
         self._plant_sampler = PlantSampler(parameters)
-        self._wanted_flows: WantedFlows | None = None
-        if parameters.action == "change":
-            self._wanted_flows = WantedFlows(parameters, 1)
+        self._wanted_flow: WantedFlow | None = None  # for the action form "change" alone
         self._signals = Signals.of(parameters)
         # Random number streams of the environment's plant; empty before the first reset.
         self._streams: list[RandomStreams] = []
@@ -337,8 +335,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         numbers = plant_numbers(arrays_of_numbers, 0)
         self._plant = Plant(self.parameters, numbers)
         self._coming_signals.clear()
-        if self._wanted_flows is not None:
-            self._wanted_flows.reset(ONLY_PLANT)
+        if self.parameters.action == "change":
+            self._wanted_flow = WantedFlow(self.parameters)
 
         # At rest, the commanded flow is 0 t/h. The action for 0 t/h depends on the limits.
         self._action = action_from_command(0.0, numbers.u_min, numbers.u_max)
@@ -404,8 +402,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
             # In reverse order, because `pop` returns the last element of the list.
             self._coming_signals = self._signals.ahead()[::-1]
         setpoint, noise, load, measurement_noise = self._coming_signals.pop()
-        if self._wanted_flows is not None:
-            a = self._wanted_flows.change(np.array([a])).item()
+        if self._wanted_flow is not None:
+            a = self._wanted_flow.change(a)
 
         command, applied, output = self._plant.step(a, noise, load)
         error = setpoint - output

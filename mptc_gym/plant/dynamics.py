@@ -164,6 +164,36 @@ class WantedFlows:
         return rounded.astype(np.float64)
 
 
+class WantedFlow(WantedFlows):
+    """The wanted flow of one plant in Python floats, equal bit for bit to `WantedFlows`.
+
+    Parameters
+    ----------
+    parameters
+        Arguments of the environment.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        super().__init__(parameters, 1)
+        self._half_range = (self._u_max - self._u_min) / 2.0
+        self._flow = 0.0  # v, t/h
+
+    def change(self, actions: float) -> float:
+        """Change the wanted flow by one finite action, and return the action that sets it."""
+        flow = self._flow + self._flow_per_action * max(-1.0, min(1.0, actions))
+        self._flow = flow = max(self._u_min, min(self._u_max, flow))
+        command = 0.0
+        if flow > 0.0:
+            command = self._dead_zone + self._slope_above * flow
+        elif flow < 0.0:
+            command = -self._dead_zone + self._slope_below * flow
+        action = float(np.float32(action_from_command(command, self._u_min, self._u_max)))
+        rounded_command = (action + 1.0) * self._half_range + self._u_min
+        if abs(command) >= self._dead_zone > abs(rounded_command):  # rarely
+            return float(self._rounded_actions(command))
+        return action
+
+
 class Dynamics:
     """The coefficients of the plant for a given steady-state gain and time constant.
 
