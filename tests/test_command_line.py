@@ -22,8 +22,8 @@ COMMANDS = {
 for path in (ROOT / "benchmarks").glob("*/__main__.py"):
     COMMANDS[path.parent.name] = f"benchmarks.{path.parent.name}.__main__"
 HEAVY = {
-    "joblib", "matplotlib", "optuna", "pandas", "pygame", "ray", "scipy", "stable_baselines3",
-    "torch",
+    "joblib", "matplotlib", "optuna", "pandas", "pygame", "ray", "scipy.optimize",
+    "scipy.sparse", "stable_baselines3", "torch",
 }  # fmt: skip
 
 
@@ -36,7 +36,7 @@ def test_help_imports_nothing_heavy():
         "import importlib, sys\n"
         f"for module in {[*COMMANDS.values()]}:\n"
         "    importlib.import_module(module).main(['--help'])\n"
-        "print(*{name.partition('.')[0] for name in sys.modules}, file=sys.stderr)"
+        "print(*sys.modules, file=sys.stderr)"
     )
     done = python("-c", program, check=True)
     assert not HEAVY & set(done.stderr.split())

@@ -7,9 +7,14 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from benchmarks.bounds.least import least_possible
+from benchmarks.bounds.linear_program import NoBoundError
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Count, command, options
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.outputs import ROOT, commit, versions, write_json
+from benchmarks.lib.statistics import bootstrap
+from benchmarks.loop.measures import mean_error
 from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions, Scenario
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import (
@@ -119,12 +124,6 @@ def row(case: Scenario, mpc_runs: int | None) -> dict[str, str]:
     The returned text is "" for the column "without preview" if set points are not random, and
     for the column "reference" if the set point changes before the plant has settled.
     """
-    from benchmarks.bounds.least import least_possible
-    from benchmarks.bounds.linear_program import NoBoundError
-    from benchmarks.controllers.roster import ROSTER
-    from benchmarks.lib.statistics import bootstrap
-    from benchmarks.loop.measures import mean_error
-
     least = partial(least_possible, samples=case.samples, **case.arguments)
     # Formatting an `Estimate`, as in f"{estimate:.4f}", adds the interval in parentheses.
     cells = {"case": case.name, "idle valve": f"{least(kind='preview').idle:.4f}"}
@@ -172,8 +171,6 @@ def packaged_case(arguments: dict[str, Any]) -> dict[str, Any]:
     error differs between episodes, the returned dict also has the list "validation_least": the
     least possible mean error, degC, of each episode with which trained policies are selected.
     """
-    from benchmarks.bounds.least import least_possible
-
     least = partial(least_possible, samples=SAMPLES, **arguments)
     published = least(seed=SEED, episodes=PACKAGED_EPISODES)
     entry = {"arguments": arguments, "kind": published.kind, "least": published.episodes}
