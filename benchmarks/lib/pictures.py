@@ -14,14 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH = 7.5  # width of a picture, inches: 975 pixels at 130 dots per inch
 TITLE_CHARACTERS = 90  # number of characters that fit in a line of a title
-PALETTE_SIZE = 128  # number of colours in a PNG file; fewer colours make the file smaller
 # matplotlib's `rcParams` for all pictures.
 STYLE: Any = {
     "axes.grid": True,
@@ -67,9 +64,7 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         characters.
     """
     from matplotlib import style  # imported here, as the import is slow
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from PIL import Image
 
     # A matplotlibrc of the caller, which may ask for LaTeX, has no influence on the picture.
     with style.context(["default", STYLE]):
@@ -78,7 +73,4 @@ def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
         lines = textwrap.wrap(sentence, TITLE_CHARACTERS, break_on_hyphens=False)
         figure.suptitle("\n".join(lines), x=0.015, ha="left", fontsize=10, weight="bold")
         yield figure
-        canvas: Any = FigureCanvasAgg(figure)
-        canvas.draw()  # `Figure.savefig` would draw twice because of the layout.
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    picture.quantize(PALETTE_SIZE, Image.Quantize.FASTOCTREE).save(path)
+        figure.savefig(path)
