@@ -14,7 +14,7 @@ from mptc_gym.rollout import rollout
 
 SAMPLES = 1200  # number of samples in an episode
 EPISODES = 100  # default number of episodes in a data set
-SEED = SEEDS["data sets"].first  # seed of the first episode of each data set
+SEED = SEEDS["data sets"].start  # seed of the first episode of each data set
 # Number of episodes on which learners are evaluated; no data set has one of these episodes.
 EVALUATION_EPISODES = 50
 # For each behaviour, the controllers that control the plant in a data set. Several controllers

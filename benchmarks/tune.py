@@ -26,14 +26,14 @@ from mptc_gym import PRESETS, Parameters
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
-SEED = SEEDS["sampler"].first  # seed of Optuna's sampler in the first trial
+SEED = SEEDS["sampler"].start  # seed of Optuna's sampler in the first trial
 STARTUP = 200  # number of trials with random gains, before Optuna's sampler chooses gains
 RUNS = 100  # number of runs of each case in a trial
-FIRST_RUN = SEEDS["preparation"].first  # seed of the first run of every trial
+FIRST_RUN = SEEDS["preparation"].start  # seed of the first run of every trial
 SPACING_OF_CASES = 100_000  # difference between the first seeds of two successive cases
 FINALISTS = 10  # number of best trials whose gains are scored again on new runs
 FINAL_RUNS = 1000  # number of new runs of each case
-FINAL_FIRST_RUN = SEEDS["finals"].first  # seed of the first new run
+FINAL_FIRST_RUN = SEEDS["finals"].start  # seed of the first new run
 NOTES = (
     "The columns from 'constant' to 'learnt, slow' give the median over the runs of the mean "
     "absolute error, in °C, in five cases: a constant set point; a square wave and a dead zone "

@@ -21,14 +21,14 @@ PAGES = [ROOT / "README.md", *ROOT.glob("*/**/*.md")]
 
 def block_of(seed):
     """Return the name of the block that holds a seed."""
-    (name,) = [name for name, block in SEEDS.items() if seed in block.seeds]
+    (name,) = [name for name, block in SEEDS.items() if seed in block]
     return name
 
 
 def test_no_two_blocks_share_a_seed():
-    blocks = sorted(SEEDS.values(), key=lambda block: block.first)
+    blocks = sorted(SEEDS.values(), key=lambda block: block.start)
     for block, later in itertools.pairwise(blocks):
-        assert block.seeds.stop <= later.first, (block, later)
+        assert block.stop <= later.start, (block, later)
 
 
 def test_every_command_stays_in_its_block():

@@ -31,7 +31,7 @@ from mptc_gym import Parameters
 # robust.
 LAMBDA = 0.1
 LEARNING = 1200  # samples of the square wave in which a controller learns before it is measured
-COMMISSIONING_SEED = SEEDS["preparation"].first  # of the episodes in which a controller learns
+COMMISSIONING_SEED = SEEDS["preparation"].start  # of the episodes in which a controller learns
 
 
 @dataclass(frozen=True, kw_only=True)

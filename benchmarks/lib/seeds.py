@@ -6,43 +6,31 @@ chosen. Random numbers outside of episodes, such as those of a bootstrap, have s
 The seeds of commands and networks that are gone stay reserved, as earlier versions used them.
 """
 
-from dataclasses import dataclass
-
 from mptc_gym import evaluation
 
-
-@dataclass(frozen=True)
-class Block:
-    """The `count` consecutive seeds from the seed `first` on, and the purpose of the seeds."""
-
-    first: int
-    count: int
-    purpose: str
-
-    @property
-    def seeds(self) -> range:
-        """The seeds in rising order."""
-        return range(self.first, self.first + self.count)
-
-
 SEEDS = {
-    "studies": Block(0, 10_000, "runs of claims and of commands that are gone"),
-    "networks": Block(10_000, 1_000, "initial weights of networks, and their training"),
-    "sampler": Block(1_000_000, 100_000, "gains that a search tries"),
-    "preparation": Block(
-        3_000_000, 500_000, "trials of a search, and runs in which a controller learns before"
+    # Runs of claims and of commands that are gone.
+    "studies": range(10_000),
+    # Initial weights of networks, and their training.
+    "networks": range(10_000, 11_000),
+    # Gains that a search tries.
+    "sampler": range(1_000_000, 1_100_000),
+    # Trials of a search, and runs in which a controller learns before.
+    "preparation": range(3_000_000, 3_500_000),
+    # Runs that choose among the best trials of a search.
+    "finals": range(4_000_000, 4_500_000),
+    # Episodes to choose policies by, with bounds in the package.
+    "validation": range(
+        evaluation.VALIDATION_SEED, evaluation.VALIDATION_SEED + evaluation.VALIDATION_EPISODES
     ),
-    "finals": Block(4_000_000, 500_000, "runs that choose among the best trials of a search"),
-    "validation": Block(
-        evaluation.VALIDATION_SEED,
-        evaluation.VALIDATION_EPISODES,
-        "episodes to choose policies by, with bounds in the package",
-    ),
-    "trials": Block(
-        6_200_000, 301_000, "episodes to try settings of the self-tuning controllers on"
-    ),
-    "published": Block(evaluation.SEED, 100_000, "episodes of published results"),
-    "data sets": Block(9_000_000, 100_000, "episodes that data sets hold"),
-    "check": Block(31_000_000, 1_000, "episodes that check the final networks, once"),
-    "training": Block(1 << 32, 1 << 32, "episodes of the plants that policies are trained on"),
+    # Episodes to try settings of the self-tuning controllers on.
+    "trials": range(6_200_000, 6_501_000),
+    # Episodes of published results.
+    "published": range(evaluation.SEED, evaluation.SEED + 100_000),
+    # Episodes that data sets hold.
+    "data sets": range(9_000_000, 9_100_000),
+    # Episodes that check the final networks, once.
+    "check": range(31_000_000, 31_001_000),
+    # Episodes of the plants that policies are trained on.
+    "training": range(1 << 32, 1 << 33),
 }

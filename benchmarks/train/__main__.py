@@ -12,7 +12,7 @@ from benchmarks.lib.outputs import new_folder, provenance_of
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.scenarios import PlantOptions
 
-SEED = SEEDS["networks"].first  # seed of the first network; network i has the seed SEED + i
+SEED = SEEDS["networks"].start  # seed of the first network; network i has the seed SEED + i
 NETWORKS = "ppo", "ppo-hard"
 
 

@@ -30,7 +30,7 @@ from mptc_gym.sb3 import make_vec_env
 
 Array = NDArray[np.float64]
 
-TRAINING_SEEDS = SEEDS["training"].first  # least seed of the training plants
+TRAINING_SEEDS = SEEDS["training"].start  # least seed of the training plants
 # Change of the flow per sample at an action of 1, as a share of half the actuator's range: with
 # 2.0, the flow can cross the entire range in a sample.
 MAX_MOVE = 2.0
