@@ -40,12 +40,6 @@ def test_the_interval_of_two_values_is_wide():
     assert statistics.student([1.0, 3.0]).high == pytest.approx(2.0 + 12.706, abs=1e-3)
 
 
-def test_what_rounds_to_zero_has_no_sign():
-    estimate = statistics.Estimate(-0.0004, -0.0106, 0.0004, 100)
-    assert f"{estimate:.3f}" == "0.000 (-0.011 to 0.000)"
-    assert f"{estimate:+.3f}" == "0.000 (-0.011 to +0.000)"
-
-
 def test_share_by_hand():
     # Wilson: (p + z^2/2n +- z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n)
     estimate = share(np.array([True] * 8 + [False] * 2))

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.pictures import AT_LEAST, AT_MOST, DEAD_ZONE, LIMIT, SETPOINT, open_picture
-from benchmarks.lib.statistics import Estimate, as_text
+from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 
@@ -59,7 +59,7 @@ def plot_scores(
         The PNG file.
     """
     labels = [controllers[agent].label for agent in scores]
-    values = [as_text(score.value, ".3f") for score in scores.values()]
+    values = [f"{score.value:.3f}" for score in scores.values()]
     title = f"{labels[0]} has the highest score, {values[0]}"
     height = 1.5 + 0.3 * len(scores)  # inches: title and axis, and the rows
     with open_picture(path, height, title) as figure:

@@ -14,7 +14,7 @@ from benchmarks.compare.runs import Bound, Result
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.command import CommandError
 from benchmarks.lib.report import Section, write_report
-from benchmarks.lib.statistics import Estimate, as_text
+from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import Scenario
 
 SCORE_TEXT = (
@@ -240,7 +240,7 @@ def on_screen(comparison: Comparison) -> str:
     A heading of two words or more, such as "square zone 7", has its first word in the line
     above.
     """
-    table = score_table(comparison, lambda estimate, form: as_text(estimate.value, form))
+    table = score_table(comparison, lambda estimate, form: format(estimate.value, form))
     table["controller"] = table["controller"].str[:LONGEST_LABEL]
     headings = {case.name: case.heading or case.name for case, _ in comparison.bounds}
     words = [headings.get(name, name).partition(" ") for name in table.columns]

@@ -39,24 +39,12 @@ class Estimate:
         """Return the estimate as text, "value (low to high)".
 
         The argument `form` is the format of each number, such as ".3f". If the two ends of the
-        interval have equal texts, the text of the estimate is only "value". If the upper end of
-        the interval is infinite, the text of the estimate is "value (one run)".
+        interval have equal texts, the text of the estimate is only "value".
         """
-        value = as_text(self.value, form)
-        low = as_text(self.low, form)
-        high = as_text(self.high, form)
-        if math.isinf(self.high):
-            return f"{value} (one run)"
-        if low == high:
-            return value
-        return f"{value} ({low} to {high})"
-
-
-def as_text(value: float, form: str) -> str:
-    """Return a number as text in the format `form`, with "0.000" in place of "-0.000"."""
-    text = format(value, form)
-    is_zero = set(text) <= set("-0.")
-    return text.lstrip("-") if is_zero else text
+        value = format(self.value, form)
+        low = format(self.low, form)
+        high = format(self.high, form)
+        return value if low == high else f"{value} ({low} to {high})"
 
 
 def student(values: ArrayLike) -> Estimate:
