@@ -257,7 +257,7 @@ class TestCompare:
         assert said in printed.err
 
     def test_a_controller_may_have_any_name(self, compared):
-        name = "<i>|$\\nope$ ../../x"
+        name = "$\\nope$ ../../x"
         option = "--agents --scenarios constant --runs 1"
         out = compared(option, "--agent", f"{name}=agents:PIController")
         assert name in {cell.text for cell in page_of(out).iter("td")}

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 from functools import partial
 
-from benchmarks.lib.command import Count, Folder, Names, command, known, options
+from benchmarks.lib.command import Count, Folder, Names, choose, command, options
 from benchmarks.lib.fan_out import FanOut
-from benchmarks.lib.outputs import new_folder, provenance_of, write_csv
+from benchmarks.lib.outputs import new_folder, provenance_of
 
 
 @options
@@ -31,16 +31,16 @@ def work(options: Options) -> None:
     from benchmarks.claims.runs import Batch
     from benchmarks.lib.report import show, write_report
 
-    names = known("CLAIM", options.claims or list(CLAIMS), CLAIMS)
+    chosen = choose("CLAIM", options.claims or list(CLAIMS), CLAIMS)
     batch = Batch(options.runs)
     provenance = provenance_of(seeds={"first": batch.seed, "runs": batch.runs})
     folder = new_folder(options.out, "claims", provenance)
     # The tests of the last claims take longest, so these tests start first.
-    tasks = {name: partial(examined, name, batch) for name in reversed(names)}
+    tasks = {name: partial(examined, name, batch) for name in reversed(chosen)}
     finished = options.fan_out.run(tasks, "claims")
     numbers = table(CLAIMS, dict(reversed(finished.results.items())))
     report = sections(CLAIMS, numbers)
-    write_csv(folder / "claims.csv", numbers)
+    numbers.to_csv(folder / "claims.csv", index=False)
     write_report(folder, "The paper's claims", report, provenance, finished.error)
     show(report[0])
     print(f"All numbers are in {folder}/report.md and claims.csv")

@@ -15,8 +15,8 @@ from benchmarks.lib.command import (
     Names,
     Parameter,
     Seed,
+    choose,
     command,
-    known,
     options,
 )
 from benchmarks.lib.fan_out import FanOut
@@ -71,8 +71,7 @@ def work(options: Options) -> None:
     from benchmarks.compare.report import write
     from benchmarks.compare.runs import least_error, run_case
 
-    names = known("--agents", options.agents, ROSTER)
-    chosen = {name: ROSTER[name] for name in names} | own_controllers(options.agent)
+    chosen = choose("--agents", options.agents, ROSTER) | own_controllers(options.agent)
     controllers, note = that_fit(chosen, options.plant)
     folder_name, scenarios = cases(options)
     provenance = provenance_of(
@@ -120,8 +119,8 @@ def cases(options: Options) -> tuple[str, dict[str, Scenario]]:
         folder_name, available = "compare-plant", dict(options.plant.cases(SCENARIOS))
     else:
         folder_name, available = "compare", SCENARIOS
-    wanted = known("--scenarios", options.scenarios or list(available), available)
-    return folder_name, {name: available[name] for name in wanted}
+    names = options.scenarios or list(available)
+    return folder_name, choose("--scenarios", names, available)
 
 
 def that_fit(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from benchmarks.compare.runs import Bound
 from benchmarks.controllers.roster import ControllerSpec
-from benchmarks.lib.outputs import write_csv
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles
 from benchmarks.loop.measures import is_random
 
@@ -139,4 +138,4 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
                 columns[f"{name}{suffix}"] = numbers.replace([math.inf, -math.inf], math.nan)
         else:
             columns[name] = cells.replace(math.inf, "not settled")
-    write_csv(path, pd.DataFrame(columns))
+    pd.DataFrame(columns).to_csv(path, index=False)

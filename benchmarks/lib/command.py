@@ -7,12 +7,9 @@ imported inside the function `work`, so that `--help` is quick.
 """
 
 import inspect
-import os
-import shlex
 import signal
 import sys
-from collections.abc import Callable, Collection, Sequence
-from contextvars import ContextVar
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -23,11 +20,15 @@ try:
 except ModuleNotFoundError as error:
     raise SystemExit(f'{error}: pip install -e ".[bench]"') from error
 
+Value = TypeVar("Value")
 Declared = TypeVar("Declared")  # a dataclass whose fields are options of a command
 
 # A decorator of dataclasses: the fields become options of a command, `--field VALUE`, also if
 # the dataclass is the type of a field of another dataclass.
 options: Callable[[type[Declared]], type[Declared]] = Parameter(name="*")
+
+# The extra of this project that installs a package, for packages that are not in `bench`.
+EXTRAS = {"minari": "data", "ray": "ray"}
 
 # Types of options.
 Count = PositiveInt
@@ -35,9 +36,6 @@ Seed = NonNegativeInt
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
 _OUT_HELP = "The folder to write to, new or empty (default: the next free one in results/)."
 Folder = Annotated[Path | None, Parameter(help=_OUT_HELP)]
-
-# The command line that this process executes, such as "python -m benchmarks.compare".
-COMMAND_LINE: ContextVar[str] = ContextVar("COMMAND_LINE", default="called from Python")
 
 
 class CommandError(Exception):
@@ -57,29 +55,30 @@ class CommandError(Exception):
         self.status = status
 
 
-def known(option: str, listed: Sequence[str], names: Collection[str]) -> list[str]:
-    """Return the names that a user typed after an option, in order and without repetitions.
+def choose(
+    option: str, names: Sequence[str], available: Mapping[str, Value]
+) -> dict[str, Value]:
+    """Return the values that a user chose by name, in the order of the names.
 
     Parameters
     ----------
     option
         Name of the command-line option for the error message, such as "--scenarios".
-    listed
-        Names that the user typed.
     names
-        All valid names.
+        Names that the user typed.
+    available
+        All values by name.
 
     Raises
     ------
     CommandError
-        If a name in `listed` is not in `names`.
+        If a name in `names` is not in `available`.
     """
-    for name in listed:
-        if name not in names:
-            raise CommandError(
-                f"{option}: there is no {name!r}; choose from {', '.join(names)}"
-            )
-    return list(dict.fromkeys(listed))
+    try:
+        return {name: available[name] for name in names}
+    except KeyError as error:
+        choices = ", ".join(available)
+        raise CommandError(f"{option}: there is no {error}; choose from {choices}") from error
 
 
 def read(declared: type[Declared], program: str, words: Sequence[str]) -> Declared | None:
@@ -109,7 +108,6 @@ def read(declared: type[Declared], program: str, words: Sequence[str]) -> Declar
         default_parameter=defaults,
         result_action="return_value",
     )
-    app["--help"].show = False
     app.default(declared)
     try:
         chosen = app(list(words), exit_on_error=False, print_error=False)
@@ -151,7 +149,6 @@ def command(
         if words is None:  # The process was started for this command only.
             words = sys.argv[1:]
             _ignore_surroundings()
-        COMMAND_LINE.set(shlex.join([*program.split(), *words]))
         try:
             chosen = read(declared, program, words)
             if chosen is not None:  # None after --help
@@ -160,7 +157,8 @@ def command(
         except CommandError as error:
             message, status = str(error), error.status
         except ModuleNotFoundError as error:
-            message, status = f'{error}: pip install -e ".[bench,data,ray]"', 2
+            extra = EXTRAS.get(str(error.name), "bench")
+            message, status = f'{error}: pip install -e ".[{extra}]"', 2
         except OSError as error:
             message, status = str(error), 1
         except KeyboardInterrupt:
@@ -172,10 +170,8 @@ def command(
 
 
 def _ignore_surroundings() -> None:
-    """Make a command independent of the notebook, terminal or scheduler that calls it."""
+    """Make a command independent of the scheduler or terminal that calls it."""
     # A scheduler stops a command by SIGTERM, which else would leave processes that run tasks.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    # A notebook names a backend that need not be installed here. No picture needs a screen.
-    os.environ["MPLBACKEND"] = "agg"
     # A terminal without Unicode shows "?" in place of a degree sign.
     sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]

@@ -143,9 +143,7 @@ def with_progress_bar(items: Iterable[Item], title: str, total: int) -> Iterable
     from rich.console import Console
     from rich.progress import track
 
-    console = Console(stderr=True)
-    hidden = not console.is_terminal
-    return track(items, title, total, console=console, transient=True, disable=hidden)
+    return track(items, title, total, console=Console(stderr=True), transient=True)
 
 
 def _connect_to_ray() -> None:

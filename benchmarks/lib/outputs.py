@@ -2,7 +2,9 @@
 
 import json
 import platform
+import shlex
 import subprocess
+import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import datetime, timezone
@@ -11,7 +13,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from benchmarks.lib.command import COMMAND_LINE, CommandError
+from benchmarks.lib.command import CommandError
 
 ROOT = Path(__file__).resolve().parents[2]  # the checkout
 PROVENANCE_FILE = "provenance.json"
@@ -24,8 +26,8 @@ def new_folder(
 ) -> Path:
     """Create a folder for the results of a command, and write `provenance` to it.
 
-    Two runs of a command at the same time get two folders, since the folder is created, and the
-    file with the provenance is written, before the results are computed.
+    Two runs of a command at the same time get two folders, since a command calls this function
+    before it computes its results.
 
     Parameters
     ----------
@@ -49,12 +51,10 @@ def new_folder(
         folder = _next_free(Path("results"), name)
     else:
         folder = chosen
-        folder.mkdir(parents=True, exist_ok=True)
         is_continued = goes_on and (folder / PROVENANCE_FILE).exists()
-        if any(folder.iterdir()) and not is_continued:
-            raise CommandError(f"--out must be a new or empty folder, got {folder} with files")
-    if not goes_on:
-        (folder / PROVENANCE_FILE).touch(exist_ok=False)  # Another run may have chosen it, too.
+        if folder.is_file() or (any(folder.glob("*")) and not is_continued):
+            raise CommandError(f"--out must be a new or empty folder, got {folder}")
+        folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / PROVENANCE_FILE, provenance)
     return folder
 
@@ -72,12 +72,12 @@ def _next_free(parent: Path, name: str) -> Path:
 def provenance_of(**details: Any) -> dict[str, Any]:
     """Return the provenance of results that are computed now, as a dict for JSON.
 
-    The keys of the dict are "command" (the command line), "started" (the present time, UTC, ISO
-    8601), "commit" (of git), "versions" (of packages), and the names in `details`, such as
-    "seeds".
+    The keys of the dict are "command" (the command line of this process), "started" (the
+    present time, UTC, ISO 8601), "commit" (of git), "versions" (of packages), and the names in
+    `details`, such as "seeds".
     """
     return {
-        "command": COMMAND_LINE.get(),
+        "command": shlex.join(["python", *sys.orig_argv[1:]]),
         "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "commit": commit(),
         "versions": versions(),
@@ -102,25 +102,15 @@ def commit() -> str:
     The result is "unknown" if git is not installed, or if the project is not in a repository of
     its own.
     """
-    if not (ROOT / ".git").exists():  # git would search the parent folders.
-        return "unknown"
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    # Without --git-dir, git would also search the parent folders for a repository.
+    git = ["git", "--git-dir=.git"]
+    describe = ["describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     with suppress(OSError):
-        run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        run = subprocess.run([*git, *describe], cwd=ROOT, capture_output=True, text=True)
         return run.stdout.strip() or "unknown"
     return "unknown"
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write `value` to the JSON file `path`, with `str(x)` for objects x unknown to JSON."""
-    write_text(path, json.dumps(value, indent=2, default=str) + "\n")
-
-
-def write_csv(path: Path, table: Any) -> None:
-    """Write `table`, a DataFrame of pandas, to the CSV file `path`, without the row index."""
-    table.to_csv(path, index=False, lineterminator="\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write `text` to the file `path`, in UTF-8 and with the line ends of Unix."""
-    path.write_text(text, encoding="utf-8", newline="\n")
+    path.write_text(json.dumps(value, indent=2, default=str) + "\n", encoding="utf-8")

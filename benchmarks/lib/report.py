@@ -12,7 +12,6 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.lib.command import CommandError
-from benchmarks.lib.outputs import write_text
 
 
 @dataclass(frozen=True)
@@ -59,46 +58,34 @@ def write_report(
     error
         Error that says which results are missing. The report begins with its first line.
     """
-    page = [f"# {escape(title)}"]
+    page = [f"# {title}"]
     if error:
         first_line, _, _ = str(error).partition("\n")
-        page.append(f"**Unfinished: {escape(first_line)}.**")
+        page.append(f"**Unfinished: {first_line}.**")
     for section in sections:
         page += _in_markdown(section)
-    origin = "{started}, commit {commit}: {command}".format_map(provenance)
-    page.append(f"{escape(origin)}\n")
-    write_text(folder / "report.md", "\n\n".join(page))
+    page.append("{started}, commit {commit}: {command}\n".format_map(provenance))
+    (folder / "report.md").write_text("\n\n".join(page), encoding="utf-8")
 
 
 def _in_markdown(section: Section) -> list[str]:
     """Return a section as blocks of Markdown, such as a heading, a paragraph or a table."""
-    blocks = [escape(text) for text in section.text]
+    blocks = list(section.text)
     if section.title:
-        blocks.insert(0, f"## {escape(section.title)}")
+        blocks.insert(0, f"## {section.title}")
     if section.table is not None:
-        cells = section.table.astype(object).map(escape).rename(columns=escape)
-        blocks.append(str(cells.to_markdown(index=False, disable_numparse=True)))
-    blocks += [f"![{escape(text)}]({name})" for name, text in section.pictures.items()]
+        blocks.append(str(section.table.to_markdown(index=False, disable_numparse=True)))
+    blocks += [f"![{caption}]({name})" for name, caption in section.pictures.items()]
     return blocks
 
 
-def escape(text: object) -> str:
-    """Return one line of Markdown for a text in which a user may have chosen a name.
-
-    Characters that would end the cell of a table, or begin HTML, are escaped.
-    """
-    one_line = " ".join(str(text).split())
-    return one_line.replace("<", "&lt;").replace("|", "\\|")
-
-
-def show(*sections: Section) -> None:
-    """Print sections of a report on the terminal."""
+def show(section: Section) -> None:
+    """Print a section of a report, without pictures, on the terminal."""
     width = shutil.get_terminal_size((150, 24)).columns
-    for section in sections:
-        for text in filter(None, (section.title, *section.text)):
-            print(textwrap.fill(text, width))
-        if section.table is not None:
-            print(on_screen(section.table))
+    for text in filter(None, (section.title, *section.text)):
+        print(textwrap.fill(text, width))
+    if section.table is not None:
+        print(on_screen(section.table))
 
 
 def on_screen(table: pd.DataFrame) -> str:
@@ -110,5 +97,4 @@ def on_screen(table: pd.DataFrame) -> str:
     width = shutil.get_terminal_size((150, 24)).columns
     first = table.columns[0]
     cells = table.astype(str).set_index(first).rename_axis(index=None, columns=first)
-    with pd.option_context("display.max_colwidth", None):
-        return cells.to_string(line_width=width - 2, max_rows=None)
+    return cells.to_string(line_width=width - 2)
