@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, Final
 
@@ -17,64 +17,43 @@ from agents.actuator import float32_action
 # Arguments of the environment for an observation of the latest three set points and the latest
 # three errors: the six inputs of the paper's network.
 PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}
+LARGEST_NUMBER: Final = 1e9  # largest size of a constructor argument, as in the environment
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
 
 
 # Each of the following functions returns the value of a constructor argument, or raises a
-# ValueError with the argument's name, the value and what is allowed.
+# ValueError with the argument's name, what is allowed and the value.
 
 
-def finite(name: str, value: Any) -> float:
-    """Return a finite number as a float."""
-    return _real(name, value, "a finite number", lambda number: True)
-
-
-def not_negative(name: str, value: Any) -> float:
-    """Return a finite number of at least 0 as a float."""
-    return _real(name, value, "a finite number of at least 0", lambda number: number >= 0.0)
-
-
-def positive(name: str, value: Any) -> float:
-    """Return a finite number above 0 as a float."""
-    return _real(name, value, "a finite number above 0", lambda number: number > 0.0)
-
-
-def nonzero(name: str, value: Any) -> float:
-    """Return a finite number other than 0 as a float."""
-    return _real(name, value, "a finite number other than 0", lambda number: number != 0.0)
-
-
-def _real(name: str, value: Any, allowed: str, is_allowed: Callable[[float], bool]) -> float:
-    """Return `value` as a float, if it is a finite number for which `is_allowed` is true."""
-    is_number = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
-    if not (is_number and math.isfinite(value) and is_allowed(value)):
+def number(name: str, value: Any, low: float = -LARGEST_NUMBER) -> float:
+    """Return a number from `low` to `LARGEST_NUMBER` as a float."""
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if not (is_number and low <= value <= LARGEST_NUMBER):
+        allowed = f"a number from {low:g} to {LARGEST_NUMBER:g}"
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
     return float(value)
 
 
-def from_0(name: str, value: Any) -> int:
-    """Return an integer of at least 0 as an int."""
-    return _integer(name, value, least=0)
+not_negative = partial(number, low=0.0)
+positive = partial(number, low=1e-9)  # not 0.0, as `number` allows the value `low` itself
 
 
-def from_1(name: str, value: Any) -> int:
-    """Return an integer of at least 1 as an int."""
-    return _integer(name, value, least=1)
+def nonzero(name: str, value: Any) -> float:
+    """Return a number other than 0 as a float."""
+    if value == 0.0:
+        raise ValueError(f"{name} must not be 0")
+    return number(name, value)
 
 
-def _integer(name: str, value: Any, least: int) -> int:
-    """Return `value` as an int, if it is an integer of at least `least`."""
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
-    if not (is_integer and value >= least):
-        raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+def integer(name: str, value: Any, low: int = 0) -> int:
+    """Return an integer of at least `low` as an int."""
+    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
+    if not (is_integer and value >= low):
+        raise ValueError(f"{name} must be an integer of at least {low}, got {value!r}")
     return int(value)
 
 
-def flag(name: str, value: Any) -> bool:
-    """Return True or False as a bool."""
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} must be True or False, got {value!r}")
-    return bool(value)
+from_1 = partial(integer, low=1)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -125,7 +104,7 @@ class Controller(ABC):
         This call runs `reset`, so `reset` must not use attributes that a subclass sets after
         the call.
         """
-        self._check(finite, "u_min", "u_max")
+        self._check(number, "u_min", "u_max")
         if self.u_min >= self.u_max:
             raise ValueError(f"u_min must be below u_max = {self.u_max!r}, got {self.u_min!r}")
         self.reset()

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import Controller, finite, flag, from_0, from_1, not_negative
-from agents.networks import check_array, open_arrays, write_arrays
+from agents.controller import Controller, from_1, integer, not_negative, number
+from agents.networks import read_arrays, write_arrays
 
 Array = NDArray[np.float64]
 
@@ -40,11 +40,10 @@ class Weights:
     def load(cls, path: str | PathLike[str]) -> Weights:
         """Return the weights in an `.npz` file that the method `save` has written.
 
-        A ValueError is raised if the file is damaged or has other contents than weights.
+        A ValueError is raised if the file is damaged, and a TypeError if the file has other
+        contents than weights.
         """
-        with open_arrays(path, "weights") as file:
-            arrays = {field.name: file[field.name] for field in fields(cls)}
-            return cls(**arrays)
+        return cls(**read_arrays(path))
 
 
 @dataclass(eq=False, kw_only=True)
@@ -131,10 +130,9 @@ class DirectNNController(Controller):
         super().__post_init__()
         self._check(from_1, "n_inputs", "n_hidden", "update_interval")
         self._check(not_negative, "eta", "eta_1", "eta_theta", "eta_1_theta", "weight_scale")
-        self._check(finite, "direction", "input_scale")
-        self._check(from_0, "error_index", "seed")
-        self._check(flag, "learning")
-        if abs(self.direction) != 1.0:
+        self._check(number, "input_scale")
+        self._check(integer, "error_index", "seed")
+        if self.direction not in (-1, 1):
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
         if self.num_envs is not None:
             self._check(from_1, "num_envs")
@@ -174,8 +172,7 @@ class DirectNNController(Controller):
         Raises
         ------
         ValueError
-            If an assigned array has a wrong shape or a value that is not finite. A ValueError
-            leaves the weights unchanged.
+            If an assigned array has a wrong shape. A ValueError leaves the weights unchanged.
         """
         arrays: dict[str, Array] = {}
         for name, stored in zip(self._shapes, self._arrays, strict=True):
@@ -188,15 +185,9 @@ class DirectNNController(Controller):
         """Replace the weights of all networks by copies of `weights`."""
         arrays = []
         for name, shape in self._shapes.items():
-            array = check_array(
-                f"weights.{name}",
-                getattr(weights, name),
-                shape,
-                self._batch_shape + shape,
-                dtype=np.float64,
-            )
-            batch = np.broadcast_to(array, (self.num_envs or 1, *shape))
-            arrays.append(np.array(batch.T, order="C"))
+            # NumPy copies the weights of a single network for each network of a batch.
+            batch = np.broadcast_to(getattr(weights, name), (self.num_envs or 1, *shape))
+            arrays.append(np.array(batch.T, np.float64, order="C"))
         # The arrays are stored transposed, in the order of the fields of `Weights`: W has the
         # shape (N, N_1, batch). With the batch axis last, the sums over nodes are fast, as they
         # add long rows.

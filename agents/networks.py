@@ -6,17 +6,16 @@ Loading a network file from an untrusted source is safe, as no code in the file 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from agents.controller import Controller, Values, from_0, not_negative, positive
+from agents.controller import Controller, Values, not_negative, positive
 
 Array = NDArray[np.floating[Any]]
 # Layers of a network in the order of computation. Each layer is a pair of weights, shape
@@ -29,79 +28,21 @@ PRETRAINED: Final = Path(__file__).parent / "pretrained"  # trained networks of 
 FORMAT: Final = 2  # version of the format of network files
 
 
-def check_array(
-    name: str, value: ArrayLike, *shapes: tuple[int, ...], dtype: Any = np.float32
-) -> NDArray[Any]:
-    """Return a copy of an array after a check that its shape is allowed and its values finite.
-
-    Parameters
-    ----------
-    name
-        Name of the array for error messages.
-    value
-        The array to check.
-    *shapes
-        Allowed shapes of the array.
-    dtype
-        NumPy type of the returned copy.
+def read_arrays(path: str | PathLike[str]) -> dict[str, NDArray[Any]]:
+    """Return the arrays in an `.npz` file by name.
 
     Raises
     ------
     ValueError
-        If the array has a shape that is not allowed, or a value that is not finite.
-    """
-    array = np.array(value, dtype)
-    if array.shape not in shapes:
-        raise ValueError(f"{name} must have shape {shapes[-1]}, got {array.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite")
-    return array
-
-
-def _checked_layers(layers: Layers, inputs: int) -> Layers:
-    """Return float32 copies of the layers of a network after a check of shapes and values.
-
-    A ValueError is raised if `layers` is empty, if the shapes of layers do not fit together, if
-    the network does not have `inputs` inputs and one output, or if a value is not finite.
-    """
-    if not layers:
-        raise ValueError("layers must hold at least one layer, got none")
-    sizes = [inputs, *(np.size(b) for _, b in layers[:-1]), 1]
-    checked = []
-    for i, (W, b) in enumerate(layers):
-        weights = check_array(f"weights of layers[{i}]", W, (sizes[i + 1], sizes[i]))
-        biases = check_array(f"biases of layers[{i}]", b, (sizes[i + 1],))
-        checked.append((weights, biases))
-    return checked
-
-
-@contextmanager
-def open_arrays(
-    path: str | PathLike[str], contents: str
-) -> Iterator[Mapping[str, NDArray[Any]]]:
-    """Open an `.npz` file as a mapping of arrays by name, for a `with` statement.
-
-    Parameters
-    ----------
-    path
-        Path of the file.
-    contents
-        Expected contents of the file in words, such as "weights", for error messages.
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged. An error in the `with` block becomes a ValueError, because the
-        file then has wrong contents.
+        If the file is damaged, or no `.npz` file.
     OSError
         If the file cannot be opened.
     """
-    with Path(path).open("rb") as raw:
+    with Path(path).open("rb") as file:
         try:
-            with np.load(raw, allow_pickle=False) as file:
-                yield file
-        except Exception as error:  # from zip, zlib, NumPy, JSON or a check
-            raise ValueError(f"{path} holds no {contents}, or is damaged: {error}") from error
+            return dict(np.load(file, allow_pickle=False))
+        except Exception as error:  # from zip, zlib or NumPy
+            raise ValueError(f"{path} is no .npz file, or is damaged: {error}") from error
 
 
 def write_arrays(path: str | PathLike[str], **arrays: Any) -> None:
@@ -163,17 +104,19 @@ class PolicyNetwork(Controller):
         self._check(not_negative, "compensated_dead_zone")
         if self.action not in ("flow", "change"):
             raise ValueError(f"action must be 'flow' or 'change', got {self.action!r}")
-        if not set(self.observation) <= set(WINDOWS):
-            raise ValueError(
-                f"observation must have only the keys {', '.join(WINDOWS)}, "
-                f"got {self.observation!r}"
-            )
-        self.observation = {
-            name: from_0(f"observation[{name!r}]", self.observation.get(name, 0))
-            for name in WINDOWS
-        }
+        self.observation = dict.fromkeys(WINDOWS, 0) | dict(self.observation)
         self.n_obs = sum(self.observation.values())
-        self.layers = _checked_layers(self.layers, self.n_obs)
+        self.layers = [
+            (np.array(W, np.float32), np.array(b, np.float32)) for W, b in self.layers
+        ]
+        # The inputs of a layer are the outputs of the layer before.
+        sizes = [self.n_obs, *(b.size for _, b in self.layers)]
+        shapes = [W.shape for W, _ in self.layers]
+        if shapes != list(zip(sizes[1:], sizes[:-1], strict=True)) or sizes[-1] != 1:
+            raise ValueError(
+                f"layers must have {self.n_obs} inputs, shapes that fit together, and one "
+                f"output, got weights of the shapes {shapes}"
+            )
 
     @property
     def interface(self) -> dict[str, Any]:
@@ -202,20 +145,20 @@ class PolicyNetwork(Controller):
         Raises
         ------
         ValueError
-            If the file is damaged or contains no policy network, or if a flow limit is out of
-            range.
+            If the file is damaged or of another version of this project, or if a flow limit is
+            out of range.
+        KeyError
+            If the file contains other arrays than those of a policy network.
         OSError
             If the file cannot be opened.
         """
-        with open_arrays(path, "policy network") as file:
-            settings = json.loads(str(file["about"]))
-            if settings.pop("format") != FORMAT:
-                raise ValueError("the file is of another version of this project")
-            number_of_layers = settings.pop("layers")
-            layers = [(file[f"W{i}"], file[f"b{i}"]) for i in range(number_of_layers)]
-            network = cls(layers, **settings)
-        # Outside the `with` block, an error for invalid flow limits does not blame the file.
-        return replace(network, u_min=u_min, u_max=u_max)
+        arrays = read_arrays(path)
+        settings = json.loads(str(arrays["about"]))
+        if settings.pop("format") != FORMAT:
+            raise ValueError(f"{path} is of another version of this project")
+        number_of_layers = settings.pop("layers")
+        layers = [(arrays[f"W{i}"], arrays[f"b{i}"]) for i in range(number_of_layers)]
+        return cls(layers, u_min=u_min, u_max=u_max, **settings)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the network, without the flow limits, to the `.npz` file `path`."""

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from agents.controller import (
     Controller,
     Values,
-    finite,
-    flag,
-    from_0,
+    integer,
     nonzero,
     not_negative,
+    number,
     positive,
 )
 
@@ -58,9 +57,8 @@ class PIController(Controller):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(finite, "kp", "ki")
-        self._check(flag, "anti_windup")
-        self._check(from_0, "error_index")
+        self._check(number, "kp", "ki")
+        self._check(integer, "error_index")
         self.n_obs = self.error_index + 1
 
     @classmethod

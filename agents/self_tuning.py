@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.bank import Bank
-from agents.controller import ModelBasedController, from_0, positive
+from agents.controller import ModelBasedController, integer, not_negative, positive
 from agents.hedge import RandomSetpoint
 from agents.law import Law
 
@@ -34,22 +34,12 @@ LONGEST_TIME_CONSTANT: Final = 45.0
 
 
 def _time_range(name: str, value: Any) -> tuple[float, float] | None:
-    """Return the shortest and the longest time in `value`, s, or None if `value` is None.
-
-    A ValueError for the argument `name` is raised unless `value` is None or two finite numbers
-    of at least 0, the shortest time first.
-    """
+    """Return the shortest and the longest time in `value`, s, or None if `value` is None."""
     if value is None:
         return None
-    try:
-        shortest, longest = map(float, value)
-    except (TypeError, ValueError):
-        shortest = longest = math.nan  # which is an error below
-    if not 0.0 <= shortest <= longest < math.inf:
-        raise ValueError(
-            f"{name} must be two finite numbers of at least 0, the shortest time first, "
-            f"got {value!r}"
-        )
+    shortest, longest = (not_negative(name, time) for time in value)
+    if shortest > longest:
+        raise ValueError(f"{name} must begin with the shortest time, got {value!r}")
     return shortest, longest
 
 
@@ -116,7 +106,7 @@ class SelfTuningController(ModelBasedController):
         super().__post_init__()
         self._check(_time_range, "delay_range", "setpoint_holds")
         self._check(positive, "setpoint_amplitude")
-        self._check(from_0, "setpoint_index", "error_index")
+        self._check(integer, "setpoint_index", "error_index")
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
         # On a slow plant, the controller changes the command at every `_samples_held`-th
         # sample. The time constant, divided by the interval between these samples, is then at

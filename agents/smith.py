@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
-from agents.controller import Values, from_0, positive
+from agents.controller import Values, integer, positive
 from agents.internal_model import InternalModelController
 from agents.pi import PIController
 
@@ -59,7 +59,7 @@ class SmithPredictor(InternalModelController):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check(positive, "closed_loop_time_constant")
-        self._check(from_0, "error_index")
+        self._check(integer, "error_index")
         rule = PIController.simc(
             gain=self.gain,
             time_constant=self.time_constant,
