@@ -57,6 +57,11 @@ class Law:
     random_setpoint
         Distribution of random set points, in units of the steady temperature change for half
         the flow range; None if the distribution is unknown.
+
+    Attributes
+    ----------
+    output_filter : OutputFilter
+        Kalman filters that estimate the gains and load disturbances of the plants.
     """
 
     def __init__(
@@ -68,7 +73,7 @@ class Law:
         random_setpoint: RandomSetpoint | None,
     ) -> None:
         self._bank = bank
-        self._filter = OutputFilter(n)
+        self.output_filter = OutputFilter(n)
         self._dead_zone_edge = np.float32(dead_zone_edge)
         self._limits = limits
         self._random_setpoint = random_setpoint
@@ -76,12 +81,6 @@ class Law:
         # Number of samples since the last change of the set point. Before a change, the number
         # of observations since the start of the episode.
         self._age: Array = np.zeros(n)
-
-    @property
-    def gain(self) -> Array:
-        """Estimated gains, divided by the gain that the step test measured, shape (n,)."""
-        gain: Array = self._filter.gain
-        return gain
 
     def flow(self, setpoint: Array, output: Array) -> Array:
         """Return the flows of a sample, as shares of half the flow range, shape (n,).
@@ -100,10 +99,10 @@ class Law:
         """
         bank = self._bank
         bank.observe(output)
-        self._filter.update(output, bank.responses, bank.pole, bank.variance)
-        forecast = self._filter.forecast(bank.pole, bank.fading)
+        self.output_filter.update(output, bank.responses, bank.pole, bank.variance)
+        forecast = self.output_filter.forecast(bank.pole, bank.fading)
         target = (self._hedged(setpoint) - forecast).astype(np.float32)
-        gain = self._filter.gain.astype(np.float32)
+        gain = self.output_filter.gain.astype(np.float32)
         model_output = (gain * bank.shares * bank.models.outputs).sum(0)
         approach = SHARE / (1.0 - bank.pole) * (target - model_output)
         wanted = (target + approach) / gain

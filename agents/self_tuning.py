@@ -168,7 +168,7 @@ class SelfTuningController(ModelBasedController):
         if self._k == 0:
             return {}
         return {
-            "gain": self.gain * self._law.gain,
+            "gain": self.gain * self._law.output_filter.gain,
             "time_constant": self._interval * np.exp(self._bank.log_constant),
             "delay": self._interval * (self._bank.delay + 1.0),
         }
