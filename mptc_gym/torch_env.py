@@ -275,9 +275,7 @@ class _Plants:
         # A command is scaled to an action and back in up to eight operations, each with a
         # relative error of at most half an eps.
         rounding = 4.0 * torch.finfo(torch.float32 if is_float32 else torch.float64).eps
-        self._edge = self._zeros + least_effective_command(
-            numbers.dead_zone, *self._limits, rounding
-        )
+        self._edge: Number = least_effective_command(numbers.dead_zone, *self._limits, rounding)
         if isinstance(numbers.delay, Tensor):  # `_response` reads the flows at these rows
             rows_of_block = self.most_samples + len(self._parameters.b) - 1
             first_rows = self._longest_delay - numbers.delay.to(torch.int64)
@@ -297,14 +295,16 @@ class _Plants:
             dead zone, and 0 beyond the limits.
         """
         command = torch.add(self._middle, a, alpha=self._half_range)
-        applied = command.clamp(*self._limits)
         if command.requires_grad:
             # The value in the dead zone is 0, but the gradient is that of the command.
+            limited = command.clamp(*self._limits)
             is_lost = command.detach().abs().le_(self._edge)
-            applied = torch.addcmul(applied, applied.detach(), is_lost, value=-1.0)
-        else:
-            # A product is much faster than an unpredictable branch.
-            applied.mul_(command.abs().gt_(self._edge))
+            applied = torch.addcmul(limited, limited.detach(), is_lost, value=-1.0)
+        elif isinstance(self._edge, Tensor):
+            # A product is much faster than a branch that depends on the command.
+            applied = command.clamp(*self._limits).mul_(command.abs().gt_(self._edge))
+        else:  # all plants have the same dead zone
+            applied = torch.hardshrink(command, self._edge).clamp_(*self._limits)
         self._flows.append(applied.clone())  # a copy, as the caller may overwrite `applied`
         return command, applied
 
