@@ -228,9 +228,16 @@ class _WantedFlows(WantedFlows):
         self._flows = self._flows.detach()
 
     def _rounded_actions(self, commands: Any) -> Any:
-        """Return the actions that command flows, t/h, rounded to float32."""
-        actions = action_from_command(commands, self._u_min, self._u_max)
-        return actions.to(torch.float32).to(commands.dtype)
+        """Return the actions that `float32_action` returns in NumPy, with gradients."""
+        actions = action_from_command(commands, self._u_min, self._u_max).to(torch.float32)
+        rounded_actions = actions.detach().to(commands.dtype)
+        rounded_commands = (rounded_actions + 1.0) * self._half_range + self._u_min
+        had_effect = commands.abs() >= self._dead_zone
+        has_effect = rounded_commands.abs() >= self._dead_zone
+        size = rounded_actions.to(torch.float32).abs().clamp(min=1.0)
+        spacing = torch.nextafter(size, 2.0 * size) - size
+        moves = (had_effect & ~has_effect) * spacing.copysign(commands.detach())
+        return (actions + moves).to(commands.dtype)
 
 
 class _Plants:
@@ -270,11 +277,9 @@ class _Plants:
         self._numbers = numbers
         for rows in (self._flows, self._past_outputs):
             rows.extend([row.masked_fill(mask, 0.0) for row in rows])  # pushes out the old rows
-        # The action form "change" rounds to float32.
-        is_float32 = self._parameters.action == "change" or self._zeros.dtype == torch.float32
         # A command is scaled to an action and back in up to eight operations, each with a
         # relative error of at most half an eps.
-        rounding = 4.0 * torch.finfo(torch.float32 if is_float32 else torch.float64).eps
+        rounding = 4.0 * torch.finfo(self._zeros.dtype).eps
         self._edge: Number = least_effective_command(numbers.dead_zone, *self._limits, rounding)
         if isinstance(numbers.delay, Tensor):  # `_response` reads the flows at these rows
             rows_of_block = self.most_samples + len(self._parameters.b) - 1

@@ -135,9 +135,7 @@ def assert_equals_numpy(n, rng, steps, partial_resets, tolerances, own, **shared
 def test_it_equals_the_environment_in_numpy(
     arguments, num_envs, mode, limit, partial_resets, differentiable, randomness
 ):
-    # In NumPy, a command for a change that is rounded into the dead zone is moved to its edge.
-    # Observations are float32 in NumPy.
-    tolerances = (3e-5, 3e-5) if arguments.get("action") == "change" else (6e-8, 1e-9)
+    tolerances = 6e-8, 1e-9  # observations are float32 in NumPy
     assert_equals_numpy(
         num_envs, np.random.default_rng(randomness), 50, partial_resets, tolerances,
         {"dtype": torch.float64, "differentiable": differentiable},

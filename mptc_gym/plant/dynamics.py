@@ -127,7 +127,8 @@ class WantedFlows:
     def __init__(self, parameters: Parameters, n: int) -> None:
         self._u_min = parameters.lowest.u_min
         self._u_max = parameters.lowest.u_max
-        self._flow_per_action = parameters.max_move * ((self._u_max - self._u_min) / 2.0)
+        self._half_range = (self._u_max - self._u_min) / 2.0
+        self._flow_per_action = parameters.max_move * self._half_range
         self._dead_zone: Any = parameters.compensated_dead_zone
         self._slope_above = self._slope(self._u_max)
         self._slope_below = self._slope(-self._u_min)
