@@ -85,8 +85,6 @@ def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, caps
     # `.ci/versions` tests without the extras, where many examples cannot run.
     if "benchmarks" in names:
         names |= COMPARE
-    if "DataCollector" in example:
-        names.add("jax")  # which Minari needs for it
     for name in names - {"agents", "benchmarks"}:
         pytest.importorskip(name, reason=f"the example needs {name}, of an extra")
     monkeypatch.chdir(tmp_path)
