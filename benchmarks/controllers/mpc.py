@@ -154,6 +154,9 @@ class PredictiveController:
         samples_back = self._delay[:, np.newaxis, np.newaxis] + 1 + np.arange(len(parameters.b))
         self._flow_columns = np.maximum(samples_back - ahead, 0)
         self._models: dict[int, _Model] = {}  # by the first sample at which the model holds
+        outputs_in_state = self._model(0).plants.outputs_in_state
+        # The state also has past values of xi, and the two parts of the load.
+        self._state_size = outputs_in_state + len(parameters.c) - 1 + 2
         self._random: RandomSetpoint | None = None
         levels = SetPointLevels(parameters)
         if levels.random and levels.amplitude > 0.0:
@@ -165,12 +168,10 @@ class PredictiveController:
     def reset(self) -> None:
         """Prepare for a new episode, which begins at rest: forget all readings and flows."""
         runs = self._num_envs
-        order = self._model(0).plants.outputs_in_state
-        size = order + len(self._parameters.c) - 1 + 2  # with the two parts of the load
         self._k = 0
         # The state of the plants, which `LinearModel.state_space_with_load` describes.
-        self._state = np.zeros((runs, size))
-        self._covariance = np.zeros((runs, size, size))
+        self._state = np.zeros((runs, self._state_size))
+        self._covariance = np.zeros((runs, self._state_size, self._state_size))
         # Column j is the flow u_a(k - j), t/h. Column 0 is always 0, since `_predict` assumes
         # that the flows from the present sample k on are 0.
         self._flows = np.zeros((runs, 1 + self._longest_delay + len(self._parameters.b)))
@@ -228,14 +229,12 @@ class PredictiveController:
 
         The forecast is the expected value of the output y(k + d + 1) at sample k, where d is
         the plant's delay in samples. The standard deviation is that of a Kalman filter after
-        `WARM_UP` samples, computed without drift of the plant. The method resets the controller
-        and changes its covariance.
+        `WARM_UP` samples, computed without drift of the plant.
         """
-        self.reset()
         plants = self._model(0).plants
+        P = np.zeros((self._num_envs, self._state_size, self._state_size))
         for k in range(1, WARM_UP):
-            self._update_covariance(*self._transition(k, plants))
-        P = self._covariance
+            _, P = self._gain_and_covariance(P, *self._transition(k, plants))
         variance = np.zeros(self._num_envs)
         # Element 0 of the state is the output. After `delay` + 1 steps, P belongs to the output
         # y(k + delay + 1), and is the one of the runs with this delay.
@@ -255,21 +254,21 @@ class PredictiveController:
         state = np.einsum("nij,nj->ni", F, self._state)
         flows = np.take_along_axis(self._flows, self._flow_columns[:, 0], axis=1)
         state[:, 0] += (flows * plants.beta).sum(axis=1)
-        gain = self._update_covariance(F, Q)
+        gain, self._covariance = self._gain_and_covariance(self._covariance, F, Q)
         self._state = state + gain * (reading - state[:, 0])[:, np.newaxis]
 
-    def _update_covariance(self, F: Array, Q: Array) -> Array:
-        """Advance the Kalman filter's covariance by a sample, and return the filter's gain.
+    def _gain_and_covariance(self, before: Array, F: Array, Q: Array) -> tuple[Array, Array]:
+        """Return the Kalman filter's gain at a sample, and its covariance after the reading.
 
-        `_transition` describes F and Q. The gain, of shape (runs, size), multiplies the
-        difference between a reading and the forecast of the reading, where size is the length
-        of the state.
+        `before` is the covariance after the reading of the previous sample, and `_transition`
+        describes F and Q. All matrices have the shape (runs, size, size), where size is the
+        length of the state. The gain, of shape (runs, size), multiplies the difference between
+        a reading and the forecast of the reading.
         """
-        P = F @ self._covariance @ F.transpose(0, 2, 1) + Q
+        P = F @ before @ F.transpose(0, 2, 1) + Q
         variance = P[:, 0, 0] + self._numbers.measurement_noise_variance
         gain: Array = P[:, :, 0] / variance[:, np.newaxis]
-        self._covariance = P - gain[:, :, np.newaxis] * P[:, np.newaxis, 0]
-        return gain
+        return gain, P - gain[:, :, np.newaxis] * P[:, np.newaxis, 0]
 
     def _transition(self, k: int, plants: LinearModel) -> tuple[Array, Array]:
         """Return the matrices F and Q of the Kalman filter for the step to sample k.
