@@ -93,7 +93,7 @@ def work(options: Options) -> None:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = options.controller
     plant = options.plant.arguments()
-    spans = spans_for(name, KnownPlant(Parameters(**plant)))
+    spans = spans_for(name, KnownPlant(plant))
     provenance = provenance_of(seeds={"sampler": SEED, "runs": FIRST_RUN})
     folder = new_folder(options.out, f"tune-{name}", provenance, goes_on=True)
     try:
@@ -176,7 +176,7 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     variance in proportion to the values of the plant. In the case "noise", even a plant without
     noise gets some noise.
     """
-    known = KnownPlant(Parameters(**plant))
+    known = KnownPlant(plant)
     # Factors that are 1 for the paper's plant.
     amplitude = known.parameters.setpoint_amplitude / PAPER.parameters.setpoint_amplitude
     duration = known.parameters.setpoint_period / PAPER.parameters.setpoint_period

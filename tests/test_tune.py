@@ -55,7 +55,7 @@ def test_no_control_pays_for_not_settling():
 )
 def test_spans_scale_with_the_plant(name, gain, of_paper, of_plant):
     # Twice the gain, of the other sign: half the gains of a controller, likewise.
-    for plant, span in ((PAPER, of_paper), (KnownPlant(Parameters(**PLANT)), of_plant)):
+    for plant, span in ((PAPER, of_paper), (KnownPlant(PLANT), of_plant)):
         assert SPANS[name](plant)[gain] == pytest.approx(span)
 
 

@@ -28,7 +28,6 @@ from benchmarks.loop.scenarios import (
     PlantOptions,
     Scenario,
 )
-from mptc_gym import Parameters
 from mptc_gym.evaluation import SEED
 
 _SCENARIOS_HELP = (
@@ -130,7 +129,7 @@ def that_fit(
 
     A `CommandError` is raised if no controller is left.
     """
-    allowed = None, KnownPlant(Parameters(**plant.arguments())).direction
+    allowed = None, KnownPlant(plant.arguments()).direction
     fitting = {name: spec for name, spec in controllers.items() if spec.direction in allowed}
     labels = [spec.label for name, spec in controllers.items() if name not in fitting]
     note = ""

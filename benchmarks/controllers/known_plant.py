@@ -1,6 +1,6 @@
 """Define `KnownPlant`: what a controller may know about a plant before a run."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -30,11 +30,13 @@ class KnownPlant:
 
     Parameters
     ----------
-    parameters
-        All arguments of the environment.
+    arguments
+        Arguments of the environment that differ from the defaults.
 
     Attributes
     ----------
+    parameters : Parameters
+        All arguments of the environment.
     limits : dict
         Limits of the flow, `u_min` and `u_max`, t/h.
     dead_zone, widest_dead_zone : float
@@ -46,7 +48,8 @@ class KnownPlant:
         not random.
     """
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, arguments: Mapping[str, Any]) -> None:
+        parameters = Parameters(**arguments)
         self.parameters = parameters
         self.limits: dict[str, Any] = {"u_min": parameters.u_min, "u_max": parameters.u_max}
         self.dead_zone = sum(parameters.range_of("dead_zone")) / 2
@@ -112,4 +115,4 @@ class KnownPlant:
         return build(float(f"{exact:.4g}"))
 
 
-PAPER = KnownPlant(Parameters())  # the paper's plant
+PAPER = KnownPlant({})  # the paper's plant

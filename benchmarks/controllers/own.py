@@ -8,7 +8,7 @@ import importlib.util
 import inspect
 import json
 import pkgutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from agents import PolicyNetwork
 from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.command import CommandError
-from mptc_gym import Parameters
 
 # The colours and markers that a user's own controllers get in turn.
 LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d")
@@ -86,7 +85,7 @@ def _with_searched_gains(file: Path) -> ControllerSpec:
         arguments=content["gains"],
         knows=content["knows"],
         searched=content["searched"],
-        direction=controller.direction and _direction(content["plant"]),
+        direction=controller.direction and KnownPlant(content["plant"]).direction,
     )
 
 
@@ -100,13 +99,8 @@ def _with_trained_networks(files: Sequence[str]) -> ControllerSpec:
         trainings=[str(Path(file).resolve()) for file in files],
         knows="trained on a simulator of this plant",
         searched=f"trained by PPO: {samples}",
-        direction=_direction(provenance.get("plant", {})),
+        direction=KnownPlant(provenance.get("plant", {})).direction,
     )
-
-
-def _direction(plant: Mapping[str, Any]) -> int:
-    """Return the sign of the gain of the plant with the environment's arguments `plant`."""
-    return KnownPlant(Parameters(**plant)).direction
 
 
 def from_factory(plant: KnownPlant, runs: int, seed: int, training: str) -> Any:

@@ -24,7 +24,6 @@ from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.measures import Agent, IdleValve, Trajectory, make_plants, rollout
-from mptc_gym import Parameters
 
 # Ratio of the closed-loop time constant of Dahlin's controller to the plant's time constant.
 # The small ratio makes the control loop fast; the filter time constant makes the control loop
@@ -103,7 +102,7 @@ class ControllerSpec:
         the controller's observation.
         """
         arguments = {**plant, **PAPER_WINDOWS}
-        agent = self.make(KnownPlant(Parameters(**arguments)), runs, seed, **self.arguments)
+        agent = self.make(KnownPlant(arguments), runs, seed, **self.arguments)
         if isinstance(agent, tuple):
             agent, interface = agent
             arguments |= interface

@@ -133,7 +133,7 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
     """
     recipe = replace(RECIPES["ppo"], plant=plant)
     scale = recipe.temperature_scale
-    known = KnownPlant(Parameters(**plant))
+    known = KnownPlant(plant)
     calm, noisy = recipe.plants
     training = {
         **plant,
@@ -336,5 +336,5 @@ def export(model: PPO, recipe: Recipe) -> PolicyNetwork:
         action="change",
         max_move=MAX_MOVE,
         compensated_dead_zone=recipe.dead_zone,
-        **KnownPlant(Parameters(**recipe.plant)).limits,
+        **KnownPlant(recipe.plant).limits,
     )
