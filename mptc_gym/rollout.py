@@ -72,23 +72,14 @@ def rollout(plants: Plants, act: Act, samples: int, seeds: Sequence[int]) -> Ite
 
 def _checked_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
     """Return actions as an array; ValueError unless they are finite, and of shape `shape`."""
-    if isinstance(actions, tuple):
-        reject("policy", actions, "a function of actions alone, such as lambda o: policy(o)[0]")
     array = np.asarray(actions)
-    if array.shape == shape and np.isfinite(array).all():
-        return array
-    advice = ""
-    if array.shape == shape[:1]:
-        advice = ": return actions[:, None]"
-    elif array.shape != shape:
-        advice = (
-            ": observations have a row for each plant, such as observations[:, 3:4]; a policy "
-            "of one observation is lambda o: numpy.stack([policy(row) for row in o])"
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(
+            f"policy must return finite actions, shape {shape}, one row for each row of the "
+            f"observations, got {shorten(actions)}, shape {array.shape}; write a policy of one "
+            "observation as lambda o: numpy.stack([policy(row) for row in o])"
         )
-    raise ValueError(
-        f"policy must return finite actions, shape {shape}, got {shorten(actions)}, shape "
-        f"{array.shape}{advice}"
-    )
+    return array
 
 
 def start(policy: Any, n: int) -> Act:
@@ -96,7 +87,7 @@ def start(policy: Any, n: int) -> Act:
 
     A policy is an object with a method `predict` or `act`, or a function of NumPy arrays. If
     the policy has a method `reset`, `start` calls `reset`. A ValueError is raised if `policy`
-    has none of these forms.
+    is a module of PyTorch, whose `forward` takes tensors.
     """
     if hasattr(policy, "predict"):
         act = _act_by_predict(policy.predict, n)
@@ -105,10 +96,8 @@ def start(policy: Any, n: int) -> Act:
     elif hasattr(policy, "forward"):  # a torch.nn.Module
         written = "lambda o: module(torch.as_tensor(o)).detach().numpy()"
         reject("policy", policy, f"a function of NumPy arrays, such as {written}")
-    elif callable(policy):
-        act = policy
     else:
-        reject("policy", policy, "a function, or an object with predict or act")
+        act = policy
     if hasattr(policy, "reset"):
         policy.reset()
     return act
@@ -271,15 +260,12 @@ def _freeze_statistics(plants: Plants) -> None:
             layer.update_running_mean = False
         if "norm_obs" in vars(layer):  # a VecNormalize
             layer.training = False
-        statistics = vars(layer).get("obs_rms", {})
-        parts = statistics.values() if isinstance(statistics, dict) else [statistics]
-        if any(part.count < 1.0 for part in parts):
-            advice = "set its obs_rms to that of the training"
-            if "norm_obs" in vars(layer):
-                advice = "write VecNormalize.load(path, env)"
+        statistics = vars(layer).get("obs_rms")
+        if statistics is not None and statistics.count < 1.0:
             raise ValueError(
                 f"env must have the statistics of the policy's training in "
-                f"{type(layer).__name__}, got initial ones: {advice}"
+                f"{type(layer).__name__}, got initial ones: set its obs_rms to that of the "
+                "training, or write VecNormalize.load(path, env)"
             )
 
 
@@ -302,12 +288,10 @@ def _check_fit(policy: Any, plants: Plants, *, is_made_by_user: bool) -> None:
         expected_spaces = policy.observation_space.shape, policy.action_space
         spaces = plants.single_observation_space.shape, plants.single_action_space
         if spaces != expected_spaces:
-            advice = "leave out the arguments that change them"
-            if training is None:
-                advice = "load the model with its environments, PPO.load(path, env=...)"
             raise ValueError(
                 f"env must have the observations and actions of the policy's training, "
-                f"{expected_spaces}, got {spaces}: {advice}"
+                f"{expected_spaces}, got {spaces}: leave out the arguments that change them, "
+                "and load a model with its environments, PPO.load(path, env=...)"
             )
 
 

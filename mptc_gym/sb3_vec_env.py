@@ -148,10 +148,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def env_method(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise a NotImplementedError: there are no single environments to call or change."""
-        raise NotImplementedError(
-            "a GymnasiumVecEnv holds no single environments to call or change: use `batch`, "
-            f"its vector environment, got {args or kwargs}"
-        )
+        raise NotImplementedError("a GymnasiumVecEnv has no single environments: use `batch`")
 
     set_attr = env_method
 
@@ -250,7 +247,8 @@ def like(
     ValueError
         If the model has no environments, or if its environments have no `EnvSpec`, or are in a
         wrapper that cannot be made again: another wrapper of Stable-Baselines3 than those
-        above, or a wrapper of Gymnasium that does not record its arguments.
+        above, a wrapper of Gymnasium that does not record its arguments, or a wrapper of
+        Gymnasium around a vector environment.
     """
     training = model.get_env()
     if training is None:
@@ -281,12 +279,8 @@ def like(
 
 def _in_layers_of(training: VecEnv, plants: VecEnv) -> VecEnv:
     """Return plants in the wrappers of Stable-Baselines3 that are around `training`."""
-    if isinstance(training, GymnasiumVecEnv):
-        batch: Any = training.batch
-        while isinstance(batch, VectorWrapper):
-            if type(batch).__name__ not in _RECORDERS:
-                _refuse(batch)
-            batch = batch.env
+    if isinstance(training, GymnasiumVecEnv) and isinstance(training.batch, VectorWrapper):
+        _refuse(training.batch)
     if not isinstance(training, VecEnvWrapper):
         return plants
     plants = _in_layers_of(training.venv, plants)
