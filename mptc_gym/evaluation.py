@@ -42,6 +42,10 @@ SAMPLES: Final = 1200  # samples of an episode, unless the environment ends the 
 # a controller can have.
 _WITHOUT_EFFECT_ON_BOUNDS: Final = *INTERFACE, "reward", "error_scale", "move_weight"
 _RESAMPLES: Final = 2000  # number of bootstrap samples for the interval of a score
+_VALVE_IDLE: Final = (  # a note on episodes
+    "the valve never moved: score the policy in the action form of its training, or choose "
+    'actions that leave the dead zone, as with action="change" and a compensated_dead_zone'
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -204,14 +208,13 @@ valve travel 10 t/h; 100 episodes, all alike
     first = count("seed", seed, 0, 2**63 - 1)
     seeds = range(first, first + episodes)
     with opened(policy, env, episodes, arguments) as plants:
-        parameters = parameters_of(plants)
-        case = case_of(parameters)
+        case = case_of(parameters_of(plants))
         # A user's code or wrapper may alter the episodes. Environments that are made from an id
         # without wrappers are one batch, which has no attribute `envs`.
         is_alterable = callable(env) or any("envs" in vars(layer) for layer in layers(plants))
         runs = _run(policy, plants, seeds, case, is_replayed=is_alterable)
     bound = find_bound(case, runs.length, seeds)
-    notes = [bound.why_not, _why_idle(runs.travels, parameters)]
+    notes = [bound.why_not, "" if runs.travels.any() else _VALVE_IDLE]
     evaluation = Evaluation(
         env=_name_of(case),
         mean_error=float(runs.errors.mean()),
@@ -282,21 +285,6 @@ def _measure(samples: Iterator[Sample], n: int) -> _Runs:
         if sample.ended.all():
             break
     return _Runs(total_errors / length, travels, length)
-
-
-def _why_idle(travels: Values, parameters: Parameters) -> str:
-    """Return why the valve never moved, with advice, or "" if the valve moved."""
-    if travels.any():
-        return ""
-    low, high = parameters.range_of("dead_zone")
-    if high == 0.0 or parameters.compensated_dead_zone > 0.0:
-        return "the valve never moved"
-    zone = f"{low:g}" if low == high else f"{low:g} to {high:g}"
-    return (
-        f"no action left the dead zone of {zone} t/h: score the policy in the action form of "
-        f'its training, train it with action="change" and compensated_dead_zone={high:g}, or '
-        "choose larger actions"
-    )
 
 
 class Bound(NamedTuple):
