@@ -76,11 +76,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         self._episode_length = UNLIMITED  # samples after which an episode is truncated
         if limit != -1:
             self._episode_length = min(UNLIMITED, int(limit))
-        try:
-            self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            allowed = ", ".join(repr(mode.value) for mode in AutoresetMode)
-            reject("autoreset_mode", autoreset_mode, f"one of {allowed}")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
         self.single_observation_space = observation_space(self.parameters)
@@ -134,8 +130,6 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         ResetNeeded
             If the first reset does not include all plants.
         """
-        if options is not None and not isinstance(options, Mapping):
-            reject("options", options, "a dict or None")
         mask = self._checked_mask(options or {})
         if not self._was_reset and not mask.all():
             raise ResetNeeded("the first reset must include all environments")
@@ -191,9 +185,9 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
 
         self._clock += 1
         observations, rewards, terminations, truncations, infos = self._advance(a)
-        if (
-            self._clock < self._next_end
-        ):  # the usual case: no episode ends, and no reset is pending
+        # The usual case: no episode ends. No plant waits for a reset either, because
+        # `_next_end` counts from the earliest start, which stays until that plant is reset.
+        if self._clock < self._next_end:
             return observations, rewards, terminations, truncations, infos
         if reset_now is not None:
             rewards = self._where(self._as_array(reset_now), 0, rewards)

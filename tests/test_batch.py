@@ -89,13 +89,12 @@ REFUSED = [
     *(("make", {name: value}, f"^{name} must be") for name, value in [
         ("num_envs", 0), ("num_envs", 2.0), ("num_envs", True),
         ("max_episode_steps", 0), ("max_episode_steps", 1.5), ("max_episode_steps", -2),
-        ("max_episode_steps", np.ones(2)), ("autoreset_mode", "Never"), ("dead_zone", -1.0),
+        ("max_episode_steps", np.ones(2)), ("dead_zone", -1.0),
         ("delay", 1.5), ("render_mode", np.ones(2)), ("render_mode", "human"),
     ]),
     *(("reset", {"seed": seed}, "seed must be") for seed in SEEDS),
     *(("reset", {"options": {"reset_mask": mask}}, "reset_mask") for mask in MASKS),
-    *(("reset", {"options": each}, "^options must be a dict or None")
-      for each in ("reset_mask", 5, [True, False])),
+    ("make", {"autoreset_mode": "Never"}, "'Never' is not a valid AutoresetMode"),
     *(("step", actions, "actions must be") for actions in ACTIONS),
 ]  # fmt: skip
 
