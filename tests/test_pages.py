@@ -6,8 +6,8 @@ A page says where its numbers come from by a comment above a table, a list or a 
 
 names files in `benchmarks/published`, or none, and why. A number of a table must stand in a row
 of these files with the same label; the rows of a table without such labels follow the sections
-of the file. A number of a text must stand in a row that the text names, if it names one. A page
-may have fewer digits than the file, or millions (M).
+of the file. A number of a text, or of an item of a list, must stand in a row that the text
+names, if it names one. A page may have fewer digits than the file, or millions (M).
 """
 
 import re
@@ -69,12 +69,8 @@ def faults_of(block, files):
     """Return the numbers on a page that its files do not have where it says."""
     rows = [row for file in files for row in rows_in(file)]
     if not block.startswith("|"):
-        named = [
-            row
-            for row in rows
-            if row[0] and re.search(rf"(?<!\w){re.escape(row[0])}(?!\w)", block)
-        ]
-        return unknown(block, named or rows)
+        items = re.split(r"\n(?=- )", block)
+        return [number for item in items for number in unknown(item, named_in(item, rows))]
     table = rows_of(block)[2:]
     known = [[row for row in rows if label in row[:2]] for label, *_ in table]
     if not all(known):
@@ -85,6 +81,16 @@ def faults_of(block, files):
     return [
         number for (_, *cells), there in pairs for number in unknown(" | ".join(cells), there)
     ]
+
+
+def named_in(text, rows):
+    """Return the rows that a text names, or all rows if it names none."""
+    named = [
+        row
+        for row in rows
+        if row[0] and re.search(rf"(?<![\w.]){re.escape(row[0])}(?!\.?\w)", text)
+    ]
+    return named or rows
 
 
 def unknown(text, rows):
