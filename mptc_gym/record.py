@@ -50,9 +50,7 @@ class Record:
         """Add the next sample of the episode, by the info that `step` returns."""
         self.k += 1
         self.infos.append(dict(info))  # a copy, as the caller may change the info
-        # Bounded, as the temperature of an unstable plant may grow beyond all floats.
-        output = max(-1e12, min(1e12, info["output"]))
-        temperatures = *self.extremes, info["setpoint"], output
+        temperatures = *self.extremes, info["setpoint"], info["output"]
         self.extremes = min(temperatures), max(temperatures)
 
     def latest(self, name: str) -> list[float]:

@@ -81,8 +81,7 @@ class Panel:
         left, top, width, height = self._rectangle
         x = left + (k - self._first) / self._record.span * width
         below_top = (self._high - value) / (self._high - self._low) * height
-        # At least 3 pixels, a line's width, inside the frame. By the order of min and max, NaN
-        # is drawn at the lower edge.
+        # At least 3 pixels, a line's width, inside the frame.
         return round(x), round(top + max(3.0, min(height - 3.0, below_top)))
 
     def _draw_axes(self) -> None:
@@ -159,8 +158,7 @@ class Panel:
 
 def frame(record: Record) -> NDArray[np.uint8]:
     """Return a picture of a record: uint8, shape (540, 960, 3), for rows, columns, RGB."""
-    # The bytes of a pixel are in the order red, green, blue, as in the returned array.
-    surface = pygame.Surface(SIZE, depth=24, masks=(0xFF, 0xFF00, 0xFF0000, 0))
+    surface = pygame.Surface(SIZE, depth=32)
     draw(surface, record)
     return np.array(pygame.surfarray.pixels3d(surface).swapaxes(0, 1), order="C")
 
