@@ -189,13 +189,13 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         # `_next_end` counts from the earliest start, which stays until that plant is reset.
         if self._clock < self._next_end:
             return observations, rewards, terminations, truncations, infos
-        if reset_now is not None:
+        if reset_now is not None:  # replaces what `_advance` returned for these plants
             rewards = self._where(self._as_array(reset_now), 0, rewards)
             self._begin_episodes(reset_now, infos)
             observations = self._window.present()
         ended = self._clock - self._starts >= self._episode_length
         truncations = self._as_array(ended)
-        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:  # in which an episode has ended
             self._add_final(ended, observations, infos)
             self._begin_episodes(ended, infos)
             observations = self._window.present()
@@ -232,7 +232,8 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             self._ended = still_ended if still_ended.any() else None
         flags = self._as_array(mask)
         first_infos = self._begin(mask)
-        # A dict and not a set, whose order would differ from process to process.
+        # The masks of a step, which are True for all plants, stay as they are. A dict lists the
+        # names and not a set, whose order would differ from process to process.
         for name in dict.fromkeys([*self._info_names, *first_infos]):
             values = first_infos.get(name, self._zeros)
             infos[name] = self._where(flags, values, infos.get(name, 0))

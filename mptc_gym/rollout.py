@@ -185,7 +185,7 @@ def _make_plants(policy: Any, env: Any, n: int, arguments: Mapping[str, Any]) ->
         reject("env", env, allowed)
     if arguments:
         raise ValueError(f"{', '.join(arguments)} must be given where env is made, in env")
-    first, second = env(), env()
+    first, second = env(), env()  # two, to see whether the function makes new ones
     if first.unwrapped is second.unwrapped:
         reject("env", first, "a function that makes a new environment at each call")
     if isinstance(first, gymnasium.Env):
@@ -249,7 +249,7 @@ def _freeze_statistics(plants: Plants) -> None:
     A ValueError is raised if statistics were never updated, or are in worker processes.
     """
     for layer in layers(plants):
-        if "processes" in vars(layer):
+        if "processes" in vars(layer):  # a SubprocVecEnv or an AsyncVectorEnv
             ask = getattr(layer, "env_method", None) or layer.call
             if any(ask("has_wrapper_attr", "update_running_mean")):
                 raise ValueError(

@@ -261,6 +261,7 @@ def like(
         )
     parameters = parameters_of(training)
     interface = {name: getattr(parameters, name) for name in INTERFACE}
+    # Made for its spec alone, into which `make` writes the arguments.
     single = gymnasium.make(env, disable_env_checker=True, **{**interface, **arguments})
     wrappers = [
         wrapper for wrapper in spec.additional_wrappers if wrapper.name not in _RECORDERS

@@ -175,7 +175,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         observations = self._window.add(setpoint, observed_error, reading, a)
         self._actions = a
         mask = self._all_true.copy()
-        infos = {  # written out entry by entry, which is faster than a loop
+        # Copies of arrays that signals and plants use again, written out entry by entry, which
+        # is faster than a loop.
+        infos = {
             "output": output.copy(),
             "_output": mask,
             "setpoint": setpoint.copy(),
