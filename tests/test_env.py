@@ -148,17 +148,19 @@ def test_bad_arguments_are_named(name):
     for value in BAD[name]:
         with pytest.raises(ValueError, match=rf"{name}.* must be .*got") as error:
             MiddlePointEnv(**{name: value})
-        assert repr(value)[:80] in str(error.value)
+        elements = value if isinstance(value, list | tuple) else ()
+        assert any(repr(each)[:80] in str(error.value) for each in (value, *elements))
         assert len(str(error.value)) < 300
 
 
 def test_what_does_not_fit_together_is_named():
     for arguments, message in [
-        ({"dead_zone": [5, 8], "u_min": -6, "u_max": 7}, "dead_zone must be small"),
-        ({"time_constant_factor": 2, "a": [1.0]}, r"slowest pole is 0\+0j, not one"),
-        ({"time_constant_factor": 2, "a": [1.0, -1.0, 0.5]}, r"pole is 0\.5.*j, not one"),
-        ({"time_constant_factor": 2, "a": [1.0, -1.0]}, r"pole is 1\+0j, not one between"),
-        ({"disturbance_amplitude": 1, "a": [1.0, -1.0]}, "not stable"),
+        ({"dead_zone": [5, 8], "u_min": -6, "u_max": 7}, "dead_zone must be at most 7"),
+        ({"time_constant_factor": 2, "a": [1.0]}, r"slowest pole .* p = 0\+0j"),
+        ({"time_constant_factor": 2, "a": [1.0, -1.0, 0.5]}, r"pole .* p = 0\.5.*j"),
+        ({"time_constant_factor": 2, "a": [1.0, -1.0]}, r"pole .* p = 1\+0j"),
+        ({"time_constant_drift": 0.4, "a": [1.0, -0.5]}, r"never below 1 - p,.* p = 0\.5"),
+        ({"disturbance_amplitude": 1, "a": [1.0, -1.0]}, "a must be stable"),
         ({"delay": [3.5, 4]}, "delay must be an integer"),
         ({"dead_zone": [0, NAN]}, "dead_zone must be a number"),
         ({"setpoint_window": 0, "error_window": 0}, "error_window"),
@@ -217,8 +219,7 @@ def test_the_spec_of_a_batch_makes_its_plants_one_by_one_or_together(given, samp
 
 BAD_ACTIONS = [
     np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.zeros(0), None, "up", "0.3", b"0.3",
-    np.str_("0.3"), np.bytes_(b"0.3"), np.array(["0.3"]), ["0.3"], np.array("0.3", object),
-    np.array([10**400], object), 0.3 + 0j,
+    np.str_("0.3"), np.bytes_(b"0.3"), np.array(["0.3"]), ["0.3"], [10**400], 0.3 + 0j,
 ]  # fmt: skip
 
 

@@ -20,7 +20,6 @@ LARGEST_NUMBER: Final[Any] = 10**9
 SETPOINTS: Final = ("square", "random")
 REWARDS: Final = ("quadratic", "absolute")
 ACTIONS: Final = ("flow", "change")
-_COEFFICIENTS = "a list of one or more numbers within +-1e9"
 _FLOAT64 = np.dtype(np.float64)  # NumPy takes a dtype faster than the type np.float64
 # The exceptions that NumPy, PyTorch and Python raise for a value that is not a number.
 NOT_A_NUMBER = AttributeError, TypeError, ValueError, OverflowError, RuntimeError
@@ -101,10 +100,8 @@ def many_actions(
 def _as_float64(values: Any) -> NDArray[np.float64] | None:
     """Return `values` as a new float64 array, or None if an element is not a number."""
     try:
-        array = np.asarray(values)
-        if array.dtype.hasobject:
-            array = np.array((array - 0.0).tolist())  # subtracting 0.0 fails for text
-        return array.astype(_FLOAT64, casting="same_kind")  # a cast that fails for text
+        # This cast fails for text, complex numbers and Python objects.
+        return np.asarray(values).astype(_FLOAT64, casting="same_kind")
     except NOT_A_NUMBER:
         return None
 
@@ -123,12 +120,6 @@ def to_python(value: Any) -> Any:
     return value
 
 
-def is_number(value: Any) -> bool:
-    """Return whether a value is a real number from -1e9 to 1e9, and not a bool."""
-    is_real = isinstance(value, Real) and not isinstance(value, bool)
-    return is_real and bool(-LARGEST_NUMBER <= value <= LARGEST_NUMBER)
-
-
 def is_count(value: Any, minimum: int = 0) -> bool:
     """Return whether a value is an integer of at least `minimum`, and not a bool."""
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
@@ -137,8 +128,9 @@ def is_count(value: Any, minimum: int = 0) -> bool:
 def number(
     name: str, value: Any, low: float = -LARGEST_NUMBER, high: float = LARGEST_NUMBER
 ) -> float:
-    """Return a number as a float; ValueError unless it is from `low` to `high`."""
-    if not is_number(value) or not low <= value <= high:
+    """Return a number as a float; ValueError unless it is real and from `low` to `high`."""
+    is_real = isinstance(value, Real) and not isinstance(value, bool)
+    if not is_real or not low <= value <= high:
         reject(name, value, f"a number from {low:g} to {high:g}")
     return float(value) + 0.0  # which turns -0.0 into 0.0
 
@@ -160,20 +152,18 @@ samples = partial(count, minimum=0)
 duration = partial(count, minimum=1)  # in samples
 
 
-def numbers(name: str, value: Any, allowed: str = _COEFFICIENTS) -> tuple[float, ...]:
+def numbers(name: str, value: Any) -> tuple[float, ...]:
     """Return a list or tuple of one or more numbers as floats; ValueError for others."""
-    is_list = isinstance(value, list | tuple) and len(value) > 0
-    if not is_list or not all(map(is_number, value)):
-        reject(name, value, allowed)
-    return tuple(map(float, value))
+    if not isinstance(value, list | tuple) or not value:
+        reject(name, value, "a list of one or more numbers")
+    return tuple(number(f"{name}[{i}]", element) for i, element in enumerate(value))
 
 
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
     """Return a polynomial's coefficients as floats; ValueError unless the first one is 1."""
-    allowed = f"{_COEFFICIENTS}, the first of them 1"
-    coefficients = numbers(name, value, allowed)
+    coefficients = numbers(name, value)
     if coefficients[0] != 1.0:
-        reject(name, value, allowed)
+        reject(name, value, "a list of numbers, the first of them 1")
     return coefficients
 
 
@@ -194,12 +184,11 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     A float is a constant set point, in degC. A tuple holds a set point for each sample, in
     degC. A ValueError is raised if `value` is not a valid set point.
     """
-    if isinstance(value, str) and value in SETPOINTS:
-        return value
-    if is_number(value):
-        return number(name, value)
-    allowed = "'square', 'random', or a number or a list of one or more within +-1e9"
-    return numbers(name, value, allowed)
+    if isinstance(value, str):
+        return str(one_of(name, value, SETPOINTS))
+    if isinstance(value, list | tuple):
+        return numbers(name, value)
+    return number(name, value)
 
 
 def number_or_range(check: Callable[[str, Any], float], name: str, value: Any) -> Number:

@@ -19,7 +19,6 @@ WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_win
 # The arguments of an environment that say what a policy observes and what its actions mean.
 INTERFACE: Final = *WINDOWS, "action", "max_move", "compensated_dead_zone"
 Value = TypeVar("Value")  # type of a `PlantNumbers` field: float, array, tensor or `Number`
-_LOAD_ARGUMENTS: Final = ("disturbance_amplitude", "disturbance_walk_variance")
 
 
 def _argument(default: Any, check: checks.Check, unit: str, meaning: str) -> Any:
@@ -247,13 +246,11 @@ class Parameters(PlantNumbers[Number]):
         self._check_actuator()
         if self.changes_time_constant:
             self._check_time_constant()
-        if self.is_disturbed and not abs(slowest_pole(self.a)) < 1.0:
-            values = self.disturbance_amplitude, self.disturbance_walk_variance
-            allowed = "0 for this a: the plant is not stable, so it has no steady state"
-            reject(", ".join(_LOAD_ARGUMENTS), values, allowed)
+        if self.is_disturbed and abs(slowest_pole(self.a)) >= 1.0:
+            reject("a", self.a, "stable: with a load disturbance, the plant has a steady state")
         if not any(self.windows):
-            names = "setpoint_window, error_window, output_window, action_window"
-            reject(names, self.windows, "such that the observation has at least one element")
+            allowed = "such that the observation has at least one element"
+            reject(", ".join(WINDOWS), self.windows, allowed)
 
     def _check_actuator(self) -> None:
         """Raise a ValueError if limits of the flow and dead zone do not fit together."""
@@ -262,21 +259,24 @@ class Parameters(PlantNumbers[Number]):
             reject("u_min", u_min, f"below u_max = {u_max}")
         largest_command = max(abs(u_min), abs(u_max))
         if self.range_of("dead_zone")[1] > largest_command:
-            allowed = "small enough for some command to pass, at most max(|u_min|, |u_max|)"
-            reject("dead_zone", self.dead_zone, f"{allowed} = {largest_command:g}")
+            allowed = f"at most {largest_command:g}, the largest magnitude of a command"
+            reject("dead_zone", self.dead_zone, allowed)
 
     def _check_time_constant(self) -> None:
-        """Raise a ValueError if `a` does not allow these changes of the time constant."""
-        names = "time_constant_factor, time_constant_drift"
-        values = self.time_constant_factor, self.time_constant_drift
+        """Raise a ValueError if `a` does not allow these changes of the time constant.
+
+        A factor t replaces the slowest pole p of 1 / A(z^-1) by 1 - (1 - p) / t, which must be
+        neither complex nor negative.
+        """
         pole = slowest_pole(self.a)
-        if pole.imag != 0.0 or not 0.0 < pole.real < 1.0:
-            allowed = f"1 for this a, whose slowest pole is {pole:g}, not one between 0 and 1"
-            reject(names, values, allowed)
-        rate = 1.0 - pole.real  # 1 / time constant, per sample
-        if self.lowest.time_constant_factor * min(self.lowest.time_constant_drift, 1.0) < rate:
-            allowed = f"such that the factor is never below {rate:g}, where the pole is 0"
-            reject(names, values, allowed)
+        shortest = self.lowest.time_constant_factor * min(self.lowest.time_constant_drift, 1.0)
+        if pole.imag != 0.0 or not 0.0 < pole.real < 1.0 or shortest < 1.0 - pole.real:
+            reject(
+                "time_constant_factor, time_constant_drift",
+                (self.time_constant_factor, self.time_constant_drift),
+                "1, or such that the factor is never below 1 - p, for a slowest pole p of a "
+                f"between 0 and 1; here, p = {pole:g}",
+            )
 
     def range_of(self, name: str) -> tuple[float, float]:
         """Return the range (low, high) of the field `name` of `PlantNumbers`.
@@ -301,7 +301,7 @@ class Parameters(PlantNumbers[Number]):
     @cached_property
     def is_disturbed(self) -> bool:
         """Whether the plant can have a load disturbance other than 0."""
-        return self._can_differ(0.0, *_LOAD_ARGUMENTS)
+        return self._can_differ(0.0, "disturbance_amplitude", "disturbance_walk_variance")
 
     def _can_differ(self, value: float, *names: str) -> bool:
         """Return whether any of the fields `names` can have a value other than `value`."""
