@@ -4,7 +4,6 @@ import json
 import re
 import runpy
 import sys
-from pathlib import Path
 
 import gymnasium
 import matplotlib.pyplot as plt
@@ -81,37 +80,43 @@ def bump_test(flow_before=0.0):
 
 
 @pytest.mark.parametrize("flow_before", [0.0, 8.0])
-def test_a_bump_test_gives_the_plant_that_made_it(flow_before, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    bump_test(flow_before).to_csv("log.csv")
-    fit_plant.main(Path("log.csv"), dead_zone=1.5, u_min=-20.0, u_max=30.0)
-    plant = json.loads(Path("plant.json").read_text(encoding="utf-8"))
+def test_a_bump_test_gives_the_plant_that_made_it(flow_before, tmp_path, capsys):
+    log, file = tmp_path / "log.csv", tmp_path / "plant.json"
+    bump_test(flow_before).to_csv(log)
+    numbers = {"dead_zone": 1.5, "u_min": -20.0, "u_max": 30.0}
+    fit_plant.main(log, file, **numbers)
+    plant = json.loads(file.read_text(encoding="utf-8"))
+    assert plant["delay"] == 2
+    assert {**numbers, "sampling_interval": 4.0}.items() <= plant.items()
     # A step response of the environment with these arguments.
-    arguments = {**plant, "delay": 0, "dead_zone": 0.0}
-    env = MiddlePointEnv(**arguments)
+    env = MiddlePointEnv(**{**plant, "delay": 0, "dead_zone": 0.0})
     env.reset()
     outputs = [env.step(np.float32([1.0]))[4]["output"] for _ in range(200)]
-    assert plant["delay"] == 2
-    numbers = {"dead_zone": 1.5, "u_min": -20.0, "u_max": 30.0, "sampling_interval": 4.0}
-    assert numbers.items() <= plant.items()
     assert outputs[-1] == pytest.approx(0.4 * 30.0, rel=0.01)
     assert outputs[9] == pytest.approx(0.4 * 30.0 * (1.0 - np.exp(-0.8)), rel=0.02)
-    assert re.search(r"flow 0 (59\.9\d|60(\.0\d?)?) degC", capsys.readouterr().out)
-    assert plt.imread("plant.png").std() > 0.0
+    printed = capsys.readouterr().out
+    assert re.search(r"flow 0 (59\.9\d|60(\.0\d?)?) degC", printed)
+    # The model explains all but the noise, whose standard deviation is 0.05 degC.
+    assert re.search(r"explains (99\.\d|100\.0)% .* rest is 0\.0(4[89]|5|5[12]) degC", printed)
+    assert plt.imread(tmp_path / "plant.png").std() > 0.0
     plt.close("all")
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "dead_zone", "message"),
     [
-        (lambda log: log.rename(columns={"flow": "valve"}), r"columns.*not found.*'flow'"),
-        (lambda log: log.replace({"time": {140.0: "noon"}}), "could not convert.*noon"),
-        (lambda log: log.drop(10), "equidistant, but 144 s comes 8 s after .* most times 4 s"),
-        (lambda log: log.assign(flow=np.clip(log.flow, -1.0, 1.0)), "outside of the dead zone"),
+        (lambda log: log.rename(columns={"flow": "valve"}), 1.5, "columns.*not found.*'flow'"),
+        (lambda log: log.replace({"time": {140.0: "noon"}}), 1.5, "could not convert.*noon"),
+        (lambda log: log.replace({"flow": {1.4: np.nan}}), 1.5, "a number in each row"),
+        (lambda log: log.drop(10), 1.5, "from 4 s to 8 s apart, the latter after 136 s"),
+        (lambda log: log.assign(flow=log.flow.clip(-1, 1)), 1.5, "outside of the dead zone"),
+        (lambda log: log, -1.5, "dead_zone must be"),
     ],
 )
-def test_a_log_that_cannot_be_fitted_is_refused(change, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    change(bump_test()).to_csv("log.csv")
+def test_a_log_that_cannot_be_fitted_is_refused(change, dead_zone, message, tmp_path):
+    log = tmp_path / "log.csv"
+    change(bump_test()).to_csv(log)
     with pytest.raises(SystemExit, match=message):
-        fit_plant.main(Path("log.csv"), dead_zone=1.5, u_min=-20.0, u_max=30.0)
+        fit_plant.main(
+            log, tmp_path / "plant.json", dead_zone=dead_zone, u_min=-20.0, u_max=30.0
+        )

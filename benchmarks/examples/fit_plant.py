@@ -1,6 +1,6 @@
 """Fit a plant to the log of a bump test, for the option `--plant` of the benchmarks.
 
-    python benchmarks/examples/fit_plant.py log.csv --dead-zone 5 --u-min -10 --u-max 10
+    python benchmarks/examples/fit_plant.py log.csv plant.json --dead-zone 5 --u-min 0 --u-max 9
     python -m benchmarks.compare --plant plant.json --agents pi-simc smith dahlin
 
 In a bump test, an operator moves the flow by hand a few times, and waits after each move until
@@ -25,10 +25,12 @@ from pathlib import Path
 import cyclopts
 import numpy as np
 import pandas as pd
-from cyclopts.types import ExistingFile
+from cyclopts.types import ExistingFile, NonExistentFile
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
+
+from mptc_gym import Parameters
 
 Array = NDArray[np.float64]
 # The longest delay that a fit tries, samples. If the delay of a plant has more samples, the log
@@ -37,21 +39,21 @@ LONGEST_DELAY = 200
 
 
 def read_log(file: Path) -> pd.DataFrame:
-    """Return a log, or exit with a message if columns are missing or times not equidistant."""
+    """Return a log, or exit with a message if numbers are missing or times not equidistant."""
     try:
-        log = pd.read_csv(file, usecols=["time", "flow", "temperature"], dtype=float).dropna()
+        log = pd.read_csv(
+            file, usecols=["time", "flow", "temperature"], dtype=float, na_filter=False
+        )
     except ValueError as error:
         raise SystemExit(
-            f"{file} must have the columns time, flow and temperature: {error}"
+            f"{file} must have the columns time, flow and temperature, separated by commas, "
+            f"with a number in each row: {error}"
         ) from error
-    times = log.time.to_numpy()
-    intervals = np.diff(times)
-    usual = np.median(intervals)
-    row = int(np.argmax(np.abs(intervals - usual)))
-    if abs(intervals[row] - usual) > 0.1 * usual:
+    intervals = np.diff(log.time)
+    if np.ptp(intervals) > 0.1 * np.median(intervals):
         raise SystemExit(
-            f"{file}: times must be equidistant, but {times[row + 1]:g} s comes "
-            f"{intervals[row]:g} s after the time before, and most times {usual:g} s"
+            f"{file}: times must be equidistant, but are from {intervals.min():g} s to "
+            f"{intervals.max():g} s apart, the latter after {log.time[intervals.argmax()]:g} s"
         )
     return log
 
@@ -91,19 +93,34 @@ def fit_lag(applied: Array, temperature: Array) -> tuple[int, float]:
     return best, float(np.exp(-1.0 / np.exp(fits[best].x[0])))
 
 
-def main(log_file: ExistingFile, *, dead_zone: float, u_min: float, u_max: float) -> None:
-    """Fit a plant to the log of a bump test, and write `plant.json` and `plant.png`.
+def main(
+    log_file: ExistingFile,
+    plant_file: NonExistentFile,
+    *,
+    dead_zone: float,
+    u_min: float,
+    u_max: float,
+) -> None:
+    """Fit a plant to the log of a bump test, and print the numbers of the plant.
 
     Parameters
     ----------
     log_file
         CSV file with the columns time (s), flow (t/h) and temperature (degC).
+    plant_file
+        New JSON file for the plant. A picture of the log and the fit gets the same name with
+        the ending `.png`.
     dead_zone
         Half width of the valve's dead zone, t/h; 0 if there is none.
     u_min, u_max
         Limits of the flow, t/h.
     """
     log = read_log(log_file)
+    interval = float(np.diff(log.time).mean())
+    try:
+        Parameters(dead_zone=dead_zone, u_min=u_min, u_max=u_max, sampling_interval=interval)
+    except ValueError as error:
+        raise SystemExit(str(error)) from error
     applied = np.where(np.abs(log.flow) < dead_zone, 0.0, np.clip(log.flow, u_min, u_max))
     if np.ptp(applied) == 0.0:
         raise SystemExit(
@@ -112,7 +129,6 @@ def main(log_file: ExistingFile, *, dead_zone: float, u_min: float, u_max: float
     temperature = log.temperature.to_numpy()
     delay, pole = fit_lag(applied, temperature)
     (gain, change, level), errors = regress(applied, temperature, delay, pole)
-    interval = float(np.diff(log.time).mean())
     plant = {
         "a": [1.0, -pole],
         "b": [gain * (1.0 - pole)],
@@ -123,17 +139,24 @@ def main(log_file: ExistingFile, *, dead_zone: float, u_min: float, u_max: float
         "u_max": u_max,
         "sampling_interval": interval,
     }
-    Path("plant.json").write_text(json.dumps(plant, indent=1))
-    log["fit"] = temperature + errors
-    panels = log.plot(
-        x="time", subplots=[("temperature", "fit"), ("flow",)], drawstyle="steps-post"
+    plant_file.write_text(json.dumps(plant, indent=1))
+    signals = {
+        "time (s)": log.time,
+        "temperature (degC)": temperature,
+        "fit (degC)": temperature + errors,
+        "flow (t/h)": log.flow,
+    }
+    panels = pd.DataFrame(signals).plot(
+        x="time (s)",
+        subplots=[("temperature (degC)", "fit (degC)"), ("flow (t/h)",)],
+        drawstyle="steps-post",
     )
-    panels[0].set_ylabel("temperature (degC)")
-    panels[1].set(xlabel="time (s)", ylabel="flow (t/h)")
-    panels[0].figure.savefig("plant.png")
+    panels[0].figure.savefig(plant_file.with_suffix(".png"))
     print(
         f"gain {gain:.4g} degC per t/h, time constant {-interval / np.log(pole):.4g} s, delay "
-        f"{delay} samples of {interval:g} s, temperature at flow 0 {level + change:.4g} degC"
+        f"{delay} samples of {interval:g} s, temperature at flow 0 {level + change:.4g} degC\n"
+        f"The fit explains {1.0 - np.var(errors) / np.var(temperature):.1%} of the variance of "
+        f"the temperature. The standard deviation of the rest is {np.std(errors):.2g} degC."
     )
 
 
