@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mptc_gym.env import INFO, HasJsonSpec, observation_space
-from mptc_gym.plant.checks import count, is_count, reject
+from mptc_gym.plant.checks import count, reject
 from mptc_gym.plant.dynamics import FACTORS
 from mptc_gym.plant.parameters import Parameters
 from mptc_gym.plant.signals import UNLIMITED
@@ -69,13 +69,9 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         """Prepare the plants; the docstring of the class describes the arguments."""
         self.parameters = Parameters(**arguments)
         self.num_envs = count("num_envs", num_envs, 1)
-        limit = -1 if max_episode_steps is None else max_episode_steps
-        if not is_count(limit, -1) or limit == 0:
-            allowed = "an integer of at least 1, or None or -1 for no limit"
-            reject("max_episode_steps", max_episode_steps, allowed)
         self._episode_length = UNLIMITED  # samples after which an episode is truncated
-        if limit != -1:
-            self._episode_length = min(UNLIMITED, int(limit))
+        if max_episode_steps not in (None, -1):
+            self._episode_length = count("max_episode_steps", max_episode_steps, 1, UNLIMITED)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
