@@ -89,7 +89,7 @@ REFUSED = [
     *(("make", {name: value}, f"^{name} must be") for name, value in [
         ("num_envs", 0), ("num_envs", 2.0), ("num_envs", True),
         ("max_episode_steps", 0), ("max_episode_steps", 1.5), ("max_episode_steps", -2),
-        ("max_episode_steps", np.ones(2)), ("dead_zone", -1.0),
+        ("dead_zone", -1.0),
         ("delay", 1.5), ("render_mode", np.ones(2)), ("render_mode", "human"),
     ]),
     *(("reset", {"seed": seed}, "seed must be") for seed in SEEDS),

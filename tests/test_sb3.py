@@ -90,16 +90,6 @@ class TestBatch:
         with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
             GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", 2))
 
-    def test_bad_arguments_are_named(self):
-        for error, message, arguments in [
-            (ValueError, "num_envs must be an integer from 1", {"n_envs": 0}),
-            (ValueError, "max_move must be", {"max_move": 7}),
-            (Error, "additional_wrappers", {"env": FlattenObservation(one()).spec}),
-            (Error, "Environment `Point` doesn't exist", {"env": "Point-v0"}),
-        ]:
-            with pytest.raises(error, match=message):
-                make_vec_env(**arguments)
-
 
 class Weights(BaseCallback):
     """Record the policy's weights, and the global random numbers, at each step."""
