@@ -12,7 +12,7 @@ from agents.hedge import RandomSetpoint
 from benchmarks.bounds import __main__ as command
 from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.least import least_possible
-from benchmarks.bounds.linear_program import equations, plan, reference, response
+from benchmarks.bounds.linear_program import plan, reference
 from benchmarks.bounds.prediction import noise_variance
 from benchmarks.bounds.unknown import error_bounds, load_changes
 from benchmarks.controllers.mpc import PredictiveController
@@ -56,14 +56,7 @@ def least_error_sum(level, samples, **arguments):
     return reference(model, error_bounds(model), setpoint).errors.sum()
 
 
-def test_responses_to_single_flows_are_those_of_the_plant():
-    model, parameters = plant_of(40, delay=3, dead_zone=0.5), Parameters()
-    G = response(*equations(model, 40))
-    pulse = signal.lfilter([0.0] * 4 + list(parameters.b), parameters.a, np.eye(40)[0])
-    for j in (0, 7, 39):
-        np.testing.assert_allclose(G[j:, j], pulse[: 40 - j], atol=1e-12)
-        assert not G[:j, j].any()
-    # A limit within which 0 is no flow, but where the dead zone makes it one.
+def test_a_dead_zone_makes_0_a_flow_within_limits_that_exclude_it():
     lowest = [plant_of(9, u_min=2.0, dead_zone=zone).limits[0] for zone in (0.0, 0.5)]
     assert lowest == [2.0, 0.0]
 
@@ -292,11 +285,15 @@ class TestPredictiveController:
         (error,) = mean_error(run_mpc(1, **case))
         assert limit * (1 - 1e-4) <= error <= 1.02 * limit
 
-    def test_it_is_of_minimum_variance_where_nothing_limits_it(self):
-        plant = {"a": (1.0, -0.9), "b": (-0.5,), "c": (1.0, 0.8, 0.15), "delay": 3}
+    @pytest.mark.parametrize("of_transmitter", [0.0, 4.0])
+    def test_it_is_of_minimum_variance_where_nothing_limits_it(self, of_transmitter):
+        plant = {
+            "a": (1.0, -0.9), "b": (-0.5,), "c": (1.0, 0.8, 0.15), "delay": 3,
+            "noise_variance": 0.5, "measurement_noise_variance": of_transmitter,
+        }  # fmt: skip
         free = {"dead_zone": 0.0, "u_min": -1e3, "u_max": 1e3, "setpoint": 0.0}
-        runs = run_mpc(100, 600, noise_variance=0.5, **plant, **free)
-        least = minimum_variance(Parameters(noise_variance=0.5, **plant))
+        runs = run_mpc(100, 600, **plant, **free)
+        least = noise_variance(plant_of(600, **plant))[-1]
         assert runs.output[100:].var() == pytest.approx(least, rel=0.03)
 
     def test_zeros_in_b_are_a_delay(self):

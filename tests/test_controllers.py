@@ -148,21 +148,6 @@ class TestOwnControllers:
         assert len(members) == 2
         assert errors(members[1], 1, 60) == errors(ROSTER["pi"], 1, 60)
 
-    def test_a_factory_names_the_environment_of_its_policy(self, written):
-        code = (
-            "def Mine():\n"
-            "    return (lambda seen: -0.1 * seen[:, 5:6]), {'action_window': 20,\n"
-            "        'setpoint_window': 5}\n"
-        )
-        (member,) = members_of(written(code))
-        expected = evaluate(
-            lambda seen: -0.1 * seen[:, 5:6], IDS["noisy"], episodes=3,
-            setpoint_window=5, action_window=20,
-        )  # fmt: skip
-        np.testing.assert_allclose(
-            errors(member, 3, 1200, **PRESETS["noisy"]), expected.errors, rtol=0, atol=1e-12
-        )
-
     @pytest.mark.parametrize("factory", ["ppo", "ppo_normalised"])
     def test_a_model_of_stable_baselines3_enters_by_the_lines_of_the_page(
         self, factory, written, tmp_path, monkeypatch
