@@ -199,8 +199,9 @@ def _bound(
         error_sum = _error_sum(parameters, kind, sampled.numbers[i], sampled.setpoints[i])
         # Solvers differ between machines in later digits.
         values.append(round(error_sum / samples, 6))
+    mean = student(values)
     idle = student(sampled.idle_errors)
-    return LeastPossible(**vars(student(values)), kind=kind, idle=idle, episodes=tuple(values))
+    return LeastPossible(**vars(mean), kind=kind, idle=idle, episodes=tuple(values))
 
 
 def _error_sum(

@@ -101,6 +101,8 @@ class ControllerSpec:
         `plant` are arguments of the environment. The returned arguments define the plant and
         the controller's observation.
         """
+        # A controller gets the paper's windows, or those for which its `make` asks. The windows
+        # in `plant` are for other policies.
         arguments = {**plant, **PAPER_WINDOWS}
         agent = self.make(KnownPlant(arguments), runs, seed, **self.arguments)
         if isinstance(agent, tuple):

@@ -40,7 +40,7 @@ class Options:
 
 
 def work(options: Options) -> None:
-    """Train and save networks, and print the validation results of all networks in the folder.
+    """Train the networks that are missing in the folder, and print a table of all of them.
 
     A `CommandError` is raised if the options name no network, or a plant for a network other
     than "ppo".
