@@ -49,8 +49,6 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     # The command that the plant computes from the action.
     rounded = u_min + (action.astype(np.float64) + 1.0) * (u_max - u_min) / 2.0
     lost_its_effect = (np.abs(command) >= dead_zone) & (np.abs(rounded) < dead_zone)
-    if not lost_its_effect.any():
-        return action
     # The plant adds 1 to the action, so the rounding of the sum can remove a step that is much
     # smaller than the float32 spacing near 1.
     spacing = np.spacing(np.maximum(np.abs(action), np.float32(1)))

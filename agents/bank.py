@@ -62,25 +62,13 @@ LEAST_LOGARITHM: Final = -30.0
 ESTIMATE_INTERVAL: Final = 2
 
 
-def model_coefficients(time_constants: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the coefficients a1, a2, b1 and b2 of plant models with gain 1 and no delay.
-
-    The equation of a model is s(k) = a1 s(k-1) + a2 s(k-2) + b1 f(k-1) + b2 f(k-2), where f is
-    the flow and s the output. The fast pole and the ratio b1 / b2 are taken from equation (28)
-    of the paper. `time_constants` are in samples, and each coefficient has the shape of
-    `time_constants`.
-    """
-    pole = np.exp(-1.0 / time_constants)
-    sum_of_b = (1.0 - pole) * (1.0 - FAST_POLE)
-    b1 = NEWER_SHARE * sum_of_b
-    return pole + FAST_POLE, -pole * FAST_POLE, b1, sum_of_b - b1
-
-
 class UndelayedModels:
     """Models with a gain of 1 and no delay, one for each time constant of each of n plants.
 
-    The function `model_coefficients` states the equation of a model. All models start with the
-    output 0.
+    The equation of a model is s(k) = a1 s(k-1) + a2 s(k-2) + b1 f(k-1) + b2 f(k-2), where f is
+    the flow and s the output. The poles of a model are exp(-1 / T), for the time constant T in
+    samples, and `FAST_POLE`. The ratio b1 / b2 is that of equation (28) of the paper. All
+    models start with the output 0.
 
     Parameters
     ----------
@@ -94,16 +82,19 @@ class UndelayedModels:
     """
 
     def __init__(self, time_constants: Array) -> None:
-        # The factors a1, a2, b1 and b2 in the equation of the models, each of shape (time
-        # constants, n).
-        self._coefficients = model_coefficients(time_constants)
+        # The denominator of the transfer function is (1 - pole/z) (1 - FAST_POLE/z), which is
+        # 1 - a1/z - a2/z^2. For a gain of 1, b1 + b2 equals the denominator at z = 1.
+        pole = np.exp(-1.0 / time_constants)
+        sum_of_b = (1.0 - pole) * (1.0 - FAST_POLE)
+        b1 = NEWER_SHARE * sum_of_b
+        self._coefficients = pole + FAST_POLE, -pole * FAST_POLE, b1, sum_of_b - b1
         self.outputs = np.zeros_like(time_constants)
         self._last_outputs = self.outputs  # s(k-1)
         self._last_flow = np.zeros_like(time_constants[0])  # f(k-1), shape (n,)
 
     def advance(self, flow: Array) -> None:
         """Compute the outputs of the next sample for the present flow f(k), shape (n,)."""
-        a1, a2, b1, b2 = self._coefficients
+        a1, a2, b1, b2 = self._coefficients  # each of shape (time constants, n)
         next_outputs = a1 * self.outputs + a2 * self._last_outputs
         next_outputs = next_outputs + b1 * flow + b2 * self._last_flow
         self._last_outputs = self.outputs
@@ -208,15 +199,17 @@ class Bank:
         self.models = UndelayedModels(constants)
         self._whiten_output = Whitening((n,))
         self._whiten_response = Whitening(constants.shape)
-        # Outputs s(k) of the models without delay, and whitened outputs, at the latest samples
-        # k, oldest first, as far back as the shortest delay.
+        # Outputs of the models without delay, and the same outputs whitened, oldest first, from
+        # s(k - d) with the shortest delay d to s(k).
         length = int(delays[0]) + 1
         rest = np.zeros_like(constants), np.zeros_like(constants)
         self._in_transit = deque([rest] * length, maxlen=length)
-        # Outputs s(k - d) in order of the delay d, from the shortest delay on. The last element
-        # is the output of the longest delay at the previous sample.
+        # Outputs s(k - d) in order of the delay d, from the shortest delay on, of shape (delays
+        # + 1, time constants, n). The last element is the output of the longest delay at the
+        # previous sample.
         self._delayed = np.zeros((len(delays) + 1, *constants.shape), np.float32)
-        # The whitened s(k - d) of each model.
+        # The whitened s(k - d) of each model, shape (delays, time constants, n), as of all sums
+        # below.
         self._regressors = np.zeros_like(self._log_priors)
         # Exponentially weighted sums over past samples: squared regressors, regressors times
         # whitened outputs, and log-likelihoods.
@@ -224,7 +217,7 @@ class Bank:
         self._products = np.zeros_like(self._log_priors)
         self._log_likelihoods = np.zeros_like(self._log_priors)
         self.variance = np.full(n, FIRST_NOISE**2, np.float32)
-        self._k = 0
+        self._k = 0  # number of measured outputs so far
         self._renew_estimates()
 
     def observe(self, output: Array) -> None:
@@ -233,8 +226,9 @@ class Bank:
         `output` is in units of the steady temperature change for half the flow range, shape
         (n,).
         """
-        # Shift by one sample: the model with the next longer delay has the same output one
-        # sample later.
+        # The model with the next longer delay has the same output one sample later, so the
+        # outputs move on by one delay. The new output of the shortest delay is the oldest in
+        # transit, because `apply` has appended s(k) at the previous sample.
         self._delayed[1:] = self._delayed[:-1]
         self._regressors[1:] = self._regressors[:-1]
         self._delayed[0], self._regressors[0] = self._in_transit[0]
@@ -262,6 +256,7 @@ class Bank:
         `whitened` is the newest measured output after the whitening filter, shape (n,), in
         units of the steady temperature change for half the flow range.
         """
+        # One-step prediction errors of all models, shape (delays, time constants, n).
         errors = whitened - self._gains * self._regressors
         squares = np.square(errors)
         self._log_likelihoods *= MODEL_FORGETTING
@@ -280,10 +275,12 @@ class Bank:
 
     def _renew_estimates(self) -> None:
         """Update the gains and probabilities of the models, and the means over the models."""
-        # Weight of the prior mean of the gain, 1, in the least squares estimate of the gain.
+        # Recursive least squares: of_prior is the weight of the gain's prior mean, which is 1.
         of_prior = self.variance / GAIN_SPREAD**2
         gains = (self._products + of_prior) / (self._information + of_prior)
         self._gains = np.clip(gains, *GAIN_LIMITS)
+        # Probabilities of the models of a plant, by the rule of Bayes. The axes 0 and 1 are the
+        # models' delays and time constants.
         logarithms = self._log_likelihoods + self._log_priors
         logarithms -= logarithms.max((0, 1))
         weights = np.exp(np.maximum(logarithms, LEAST_LOGARITHM))

@@ -216,16 +216,19 @@ class DirectNNController(Controller):
         X = self.input_scale * np.ascontiguousarray(rows[:, : self.n_inputs].T)  # (N, batch)
         e = rows[:, self.error_index]
 
+        # W has the shape (N, N_1, batch). theta_1, W_1 and X_1 have the shape (N_1, batch), and
+        # theta_2 and X_2 the shape (batch,).
         W, theta_1, W_1, theta_2 = self._arrays
-        X_1 = _sigmoid(_sum_of_rows(W * X[:, np.newaxis]) + theta_1)  # step A
-        X_2 = _sigmoid(_sum_of_rows(W_1 * X_1) + theta_2)  # step B
+        X_1 = _sigmoid(_sum_of_rows(W * X[:, np.newaxis]) + theta_1)  # step A, equation (4)
+        X_2 = _sigmoid(_sum_of_rows(W_1 * X_1) + theta_2)  # step B, equation (5)
         u = X_2 * (self.u_max - self.u_min) + self.u_min  # last formula of Section 4
 
         if self.learning and self._sample % self.update_interval == 0:
             delta_1 = e * self.direction * X_2 * (1.0 - X_2)  # equation (27) of the paper
             # The paper computes delta with W_1(k), so delta must be computed before W_1 is
             # updated.
-            delta = delta_1 * W_1 * X_1 * (1.0 - X_1)
+            delta = delta_1 * W_1 * X_1 * (1.0 - X_1)  # equation (9)
+            # Each += changes an array of `self._arrays` in place.
             W_1 += self.eta_1 * delta_1 * X_1  # step C
             W += self.eta * delta * X[:, np.newaxis]  # step D
             theta_2 += self.eta_1_theta * delta_1  # step E

@@ -47,6 +47,8 @@ class RandomSetpoint:
         ahead
             Number of future samples for which the probability is computed, shape (n,).
         """
+        # The possible durations are the whole numbers from `shortest` to `longest`, of which
+        # `longest - age` are longer than an age of at least `shortest`.
         durations = self.longest - self.shortest + 1.0  # number of possible durations
         # Share of the possible durations that are longer than `ages`, and share that are longer
         # than `ages + ahead`. The least share 1e-9 prevents a division by 0.
@@ -85,6 +87,7 @@ class RandomSetpoint:
         for _ in range(BISECTIONS):
             targets = 0.5 * (near_zero + near_setpoint)
             left_side = held * np.tanh(slopes * (targets - setpoints)) + pulls_to_zero * targets
+            # For a positive set point, the left side is negative below the solution.
             is_too_near_zero = left_side * np.sign(setpoints) < 0.0
             near_zero = np.where(is_too_near_zero, targets, near_zero)
             near_setpoint = np.where(is_too_near_zero, near_setpoint, targets)

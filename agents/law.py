@@ -98,16 +98,16 @@ class Law:
             Measured outputs y(k), in the unit of `setpoint`, shape (n,), in float32.
         """
         bank = self._bank
-        bank.observe(output)
+        bank.observe(output)  # before all else, as the following lines use the new estimates
         self.output_filter.update(output, bank.responses, bank.pole, bank.variance)
         forecast = self.output_filter.forecast(bank.pole, bank.fading)
-        target = (self._hedged(setpoint) - forecast).astype(np.float32)
-        gain = self.output_filter.gain.astype(np.float32)
-        model_output = (gain * bank.shares * bank.models.outputs).sum(0)
+        target = (self._hedged(setpoint) - forecast).astype(np.float32)  # r
+        gain = self.output_filter.gain.astype(np.float32)  # g
+        model_output = (gain * bank.shares * bank.models.outputs).sum(0)  # m
         approach = SHARE / (1.0 - bank.pole) * (target - model_output)
         wanted = (target + approach) / gain
         flow: Array = np.clip(avoid_dead_zone(wanted, self._dead_zone_edge), *self._limits)
-        bank.apply(flow)
+        bank.apply(flow)  # moves the models on to the next sample
         return flow
 
     def _hedged(self, setpoint: Array) -> Array:

@@ -84,7 +84,7 @@ class OutputFilter:
         self._covariances = np.zeros((filters, n, 4, 4))
         self._covariances[:, :, GAIN, GAIN] = GAIN_SPREAD**2
         self._log_likelihoods = np.zeros((filters, n))
-        self._response = np.zeros(n)
+        self._response = np.zeros(n)  # mean output s of the models at the latest sample
 
     def update(self, output: Array, responses: Array, poles: Array, variances: Array) -> None:
         """Update the estimates with the measured outputs; call this method once per sample.
@@ -104,19 +104,23 @@ class OutputFilter:
             Variances of the candidate models' one-step prediction errors, in the squared unit
             of `output`, shape (n,).
         """
-        # The probabilities of the candidate models may have changed since the previous sample.
         response, last_response = responses
+        # `self._response` is s(k-1) with the models' probabilities at the previous sample, and
+        # `last_response` is s(k-1) with their present probabilities.
         self._attribute_to_load(last_response - self._response, poles)
         self._response = response
-        # Predict the states of this sample from the states of the previous sample.
+        # Predict the states x and their covariances P of this sample from those of the previous
+        # sample: F x and F P F^T + Q, for the transition matrix F and the noise covariances Q.
+        # In the sums, f is the filter, n the plant, and i and j are elements of the state.
         noises = NOISE_SHARES[:, np.newaxis] * variances
         transition, disturbances = self._matrices(poles, noises)
         states = np.einsum("nij,fnj->fni", transition, self._states)
         covariances = transition @ self._covariances @ transition.transpose(0, 2, 1)
         covariances = covariances + disturbances
-        # Predict the output, which is the residual plus the gain times the response. The cross
-        # covariances are the covariances between the elements of the state vector and the
-        # output.
+        # Predict the output, which is the residual plus the gain times the response: h x, for
+        # the row h = (1, 0, 0, s). The cross covariances P h^T are the covariances between the
+        # elements of the state and the output, and the variance of the output's prediction
+        # error is h P h^T plus the variance of the measurement noise.
         of_gain = response[:, np.newaxis] * covariances[:, :, :, GAIN]
         cross_covariances = covariances[:, :, :, RESIDUAL] + of_gain
         error_variances = (
@@ -124,7 +128,8 @@ class OutputFilter:
         )
         error_variances = error_variances + READING_SHARE * noises
         errors = output - states[:, :, RESIDUAL] - response * states[:, :, GAIN]
-        # Correct the states by the prediction errors of the outputs.
+        # Correct the states by the prediction errors of the outputs. The corrections are the
+        # Kalman gains.
         corrections = cross_covariances / error_variances[:, :, np.newaxis]
         self._states = states + corrections * errors[:, :, np.newaxis]
         products = corrections[:, :, :, np.newaxis] * cross_covariances[:, :, np.newaxis, :]
@@ -167,9 +172,11 @@ class OutputFilter:
         in units of the steady temperature change for half the flow range, and `poles` are the
         slow poles exp(-1 / T) of the plants, both of shape (n,).
         """
+        # The output y(k-1) is the residual plus the gain times s(k-1), and does not change. A
+        # constant load disturbance w adds w to v(k-1) and v(k-2).
         residuals = -self._states[:, :, GAIN] * changes
         self._states[:, :, RESIDUAL] += residuals
-        self._states[:, :, CARRIED] -= poles * FAST_POLE * residuals
+        self._states[:, :, CARRIED] -= poles * FAST_POLE * residuals  # a2 is -poles FAST_POLE
         self._states[:, :, LOAD] += residuals
 
     def _matrices(self, poles: Array, noises: Array) -> tuple[Array, Array]:
@@ -182,7 +189,9 @@ class OutputFilter:
         n = len(poles)
         a1 = poles + FAST_POLE
         a2 = -poles * FAST_POLE
-        # Row i of a transition matrix has the factors for element i of the state vector.
+        # The equations in the docstring of the class, as a step from sample to sample: v(k)
+        # is a1 v(k-1) plus the carried term, plus the effects of w(k) and xi(k). Row i of a
+        # transition matrix has the factors for element i of the state vector.
         transition = np.zeros((n, 4, 4))
         transition[:, RESIDUAL, RESIDUAL] = a1
         transition[:, RESIDUAL, CARRIED] = 1.0
@@ -208,6 +217,7 @@ class OutputFilter:
         `errors` are the one-step prediction errors of this sample, and `variances` are the
         error variances that the Kalman filters expected, both of shape (filters, n).
         """
+        # -2 times the logarithm of the Gaussian likelihood, without its constant.
         losses = np.square(errors) / variances + np.log(variances)
         self._log_likelihoods *= FILTER_FORGETTING
         self._log_likelihoods -= 0.5 * LIKELIHOOD_FACTOR * losses

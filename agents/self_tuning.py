@@ -176,7 +176,7 @@ class SelfTuningController(ModelBasedController):
     def reset(self) -> None:
         """Forget past samples and estimates, as the next plant may be different."""
         super().reset()
-        self._k = 0
+        self._k = 0  # number of samples since the start of the episode
 
     def _start(self, n: int) -> None:
         """Create the estimators and the control law for n plants at the start of an episode."""
