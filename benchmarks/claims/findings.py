@@ -22,7 +22,9 @@ NOTE = (
     "interval. The column 'asked' has the criterion that a claim must meet. A criterion is "
     "met, and 'shown' is 'yes', only if the entire confidence interval satisfies the "
     "criterion. A claim holds if all its criteria are met, and it holds in part if some of "
-    "its criteria are met. A value without a criterion is for information only."
+    "its criteria are met. A claim is undecided if the intervals of all numbers are too wide "
+    "to decide on any criterion; more runs make them narrower. A value without a criterion is "
+    "for information only."
 )
 # Least share of runs for claims such as "the controller works" or "the weights converge".
 MOST_RUNS = 0.9
@@ -109,17 +111,17 @@ def judge_times(quantity: str, samples: ArrayLike) -> Iterator[Finding]:
 def verdict(findings: Iterable[Finding]) -> str:
     """Return the verdict on a claim in words, from all findings about the claim.
 
-    Findings without a criterion do not count in the verdict, and an undecided finding counts as
-    a criterion that is not met.
+    Findings without a criterion do not count in the verdict. Beside other findings, an
+    undecided finding counts as a criterion that is not met.
     """
-    is_met = [finding["shown"] == "yes" for finding in findings if finding["shown"]]
-    if not is_met:
+    answers = {finding["shown"] for finding in findings} - {""}
+    if not answers:
         return "cannot be tested from the text"
-    if all(is_met):
+    if answers == {"yes"}:
         return "holds"
-    if any(is_met):
+    if "yes" in answers:
         return "holds in part"
-    return "does not hold"
+    return "does not hold" if "no" in answers else "undecided"
 
 
 def table(claims: Mapping[str, Any], findings: Mapping[str, Sequence[Finding]]) -> pd.DataFrame:
