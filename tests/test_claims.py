@@ -28,10 +28,10 @@ class TestVerdicts:
         both = {"at_least": 0.5, "at_most": 1.9}
         for bounds, criterion, answer, verdict_in_words in [
             ({"at_least": 0.5}, "at least 0.5", "yes", "holds"),
-            ({"at_most": 1.5}, "at most 1.5", "undecided", "does not hold"),
+            ({"at_most": 1.5}, "at most 1.5", "undecided", "undecided"),
             ({"at_least": 2.5}, "at least 2.5", "no", "does not hold"),
             ({"at_most": 0.5}, "at most 0.5", "no", "does not hold"),
-            (both, "at least 0.5 and at most 1.9", "undecided", "does not hold"),
+            (both, "at least 0.5 and at most 1.9", "undecided", "undecided"),
             (INFORMATION, "", "", "cannot be tested from the text"),
         ]:
             (finding,) = asked(bounds)
@@ -40,6 +40,7 @@ class TestVerdicts:
             assert verdict([finding]) == verdict(asked(bounds, INFORMATION)) == verdict_in_words
             with_good = "holds" if answer in ("yes", "") else "holds in part"
             assert verdict(asked(bounds, GOOD)) == with_good
+        assert verdict(asked({"at_most": 1.5}, {"at_most": 0.5})) == "does not hold"
 
     def test_the_report_by_hand(self, monkeypatch):
         for name, statement in (("good", "It is good"), ("none", "It cannot be")):
@@ -107,8 +108,8 @@ class TestCommand:
 
     def test_short_runs_of_all_claims_give_the_numbers_that_they_gave(self, monkeypatch):
         class Short(Batch):
-            def run(self, agent, samples, before=None, **arguments):
-                return super().run(agent, min(samples, 60), before, **arguments)
+            def run(self, agent, samples, **arguments):
+                return super().run(agent, min(samples, 60), **arguments)
 
         monkeypatch.setattr(examinations, "LEARNING_LENGTH", 30)
         rows = [

@@ -8,19 +8,20 @@ examines one claim, or two similar claims.
 import itertools
 import math
 from collections.abc import Iterable, Mapping
-from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from agents import DirectNNController, PIController
 from benchmarks.claims.findings import MOST_RUNS, Finding, judge, judge_share, judge_times
-from benchmarks.claims.runs import PAPER_LENGTH, Batch, WeightLog, converged_at
+from benchmarks.claims.runs import PAPER_LENGTH, Batch, converged_at
 from benchmarks.loop import linear
 from benchmarks.loop.measures import mean_error, settled
 from benchmarks.loop.scenarios import SETPOINTS as PAPER_SETPOINTS
 from benchmarks.loop.scenarios import Arguments, Scenario
 from mptc_gym import PRESETS, Parameters
+from mptc_gym.rollout import Act
 
 # Limits that give words of the claims, such as "notable", a meaning. The limits were chosen
 # before any run, and are the same for all claims.
@@ -32,7 +33,7 @@ SETPOINT_LEVEL = 5.0  # degC, the constant set point, and the amplitude of the s
 RUN_LENGTH = 1200  # length of a run, samples, unless the case has another length
 LEARNING_LENGTH = 600  # samples after which a network counts as trained
 WITH_NOISE = PRESETS["noisy"]
-NOISY_SQUARE_TITLE = "square wave, R = 0.5 °C²"
+NOISY_SQUARE = Scenario("noisy-square", "square wave, R = 0.5 °C²", RUN_LENGTH, WITH_NOISE)
 # Cases with different set points. The case with a constant set point comes first, as the error
 # in this case comes from initial learning alone.
 SETPOINTS = PAPER_SETPOINTS[::-1]
@@ -53,10 +54,8 @@ Findings = Iterable[Finding]
 def convergence(batch: Batch) -> Findings:
     """Yield findings about the time after which the weights of the paper's network converge."""
     for setpoint in SETPOINTS:
-        networks = batch.networks()
-        log = WeightLog(networks)
-        batch.run(networks, setpoint.samples, log, **setpoint.arguments)
-        times = converged_at(np.array(log.weights))  # samples; infinite if not converged
+        weights = batch.log_weights(setpoint.samples, **setpoint.arguments)
+        times = converged_at(weights)  # samples; infinite if not converged
         title = setpoint.title
         yield judge_share(
             f"weights converged within {PAPER_CONVERGENCE} samples, {title}",
@@ -134,13 +133,8 @@ def pi_gains(batch: Batch) -> Findings:
         "°C",
         at_least=2 * 0.05 * SETPOINT_LEVEL,
     )
-    cases = {
-        "constant set point": CONSTANT_SETPOINT,
-        "square wave": SQUARE_WAVE,
-        NOISY_SQUARE_TITLE: WITH_NOISE,
-    }
-    for title, arguments in cases.items():
-        yield best_lower_gain(batch, title, arguments)
+    for case in (*SETPOINTS, NOISY_SQUARE):
+        yield best_lower_gain(batch, case)
     runs = batch.run_pi(DOUBLED_PI, RUN_LENGTH, **CONSTANT_SETPOINT)
     limited_share = 100 * np.mean(np.abs(runs.applied[-300:]) == Parameters().u_max)
     yield judge(
@@ -160,15 +154,20 @@ def pi_gains(batch: Batch) -> Findings:
     yield judge(f"{quantity}, the best Kp of 0.1 to {kp:g}", smallest)
 
 
-def best_lower_gain(batch: Batch, title: str, arguments: Arguments) -> Finding:
-    """Compare the paper's PI controller with the best PI controller with a lower gain Kp."""
-    errors = [mean_error(batch.run_pi(gains, RUN_LENGTH, **arguments)) for gains in LOWER_PI]
+def best_lower_gain(batch: Batch, case: Scenario) -> Finding:
+    """Compare the paper's PI controller with the best PI controller with a lower gain Kp.
+
+    The runs have `RUN_LENGTH` samples, whatever the length of the case.
+    """
+    errors = [
+        mean_error(batch.run_pi(gains, RUN_LENGTH, **case.arguments)) for gains in LOWER_PI
+    ]
     paper_errors = errors[-1]  # LOWER_PI ends with the paper's gains.
     medians = [float(np.median(error)) for error in errors[:-1]]
     best = int(np.argmin(medians))
     return judge(
         f"mean error with the best lower Kp ({LOWER_PI[best]['kp']:.1f}) as a multiple of "
-        f"the error with {PAPER_PI['kp']:g}, {title}",
+        f"the error with {PAPER_PI['kp']:g}, {case.title}",
         (errors[best] / paper_errors).squeeze(),  # Without noise, each array has one number.
         at_least=1 - NOTABLE_CHANGE,
     )
@@ -240,8 +239,7 @@ def other_shapes(batch: Batch, shapes: Mapping[str, dict[str, int]]) -> Findings
     with the paper's learning rates, and with smaller learning rates (the argument
     `in_proportion` of `Batch.networks`).
     """
-    noisy_square = Scenario("noisy-square", NOISY_SQUARE_TITLE, RUN_LENGTH, WITH_NOISE)
-    for case in (*SETPOINTS, noisy_square):
+    for case in (*SETPOINTS, NOISY_SQUARE):
         paper_errors = mean_error(batch.run_nn(case.samples, **case.arguments))
         for (title, shape), in_proportion in itertools.product(shapes.items(), (False, True)):
             networks = batch.networks(**shape, in_proportion=in_proportion)
@@ -267,8 +265,8 @@ def reliability(batch: Batch) -> Findings:
         errors = {}  # mean errors after the failure, by the number of nodes
         for nodes in (3, 6, 12):
             networks = batch.networks(nodes=nodes, in_proportion=in_proportion)
-            damage = partial(damage_networks, networks, stuck_at)
-            runs = batch.run(networks, 2 * LEARNING_LENGTH, damage, **CONSTANT_SETPOINT)
+            act = with_failing_node(networks, stuck_at)
+            runs = batch.run(act, 2 * LEARNING_LENGTH, **CONSTANT_SETPOINT)
             runs_before, runs_after = runs[:LEARNING_LENGTH], runs[LEARNING_LENGTH:]
             errors[nodes] = mean_error(runs_after)
             case = f"{nodes} nodes, one stuck at {stuck_at}, {WORDS_FOR_RATES[in_proportion]}"
@@ -288,20 +286,27 @@ def reliability(batch: Batch) -> Findings:
                 )
 
 
-def damage_networks(networks: DirectNNController, stuck_at: int, k: int) -> None:
-    """Damage the first hidden node of each network if the sample k is `LEARNING_LENGTH`.
+def with_failing_node(networks: DirectNNController, stuck_at: int) -> Act:
+    """Return a function that acts like networks in which the first hidden node fails.
 
-    After the damage, the output of the damaged node is always `stuck_at`, which is 0 or 1. All
-    undamaged nodes continue to learn.
+    The function must be called once for each sample of a run. From sample `LEARNING_LENGTH` on,
+    the output of the failed node is always `stuck_at`, which is 0 or 1. All other nodes
+    continue to learn.
     """
-    if k != LEARNING_LENGTH:
-        return
-    weights = networks.weights
-    weights.W[..., 0, :] = 0.0
-    # With a threshold of this size, the slope of the node's sigmoid function is 0, so that the
-    # node cannot learn.
-    weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
-    networks.weights = weights
+    samples = itertools.count()
+
+    def act(observations: Any) -> Any:
+        """Return the actions of the networks, after the failure if it is time for it."""
+        if next(samples) == LEARNING_LENGTH:
+            weights = networks.weights
+            weights.W[..., 0, :] = 0.0
+            # With a threshold of this size, the slope of the node's sigmoid function is 0, so
+            # that the node cannot learn.
+            weights.theta_1[..., 0] = 1e6 if stuck_at else -1e6
+            networks.weights = weights
+        return networks.act(observations)
+
+    return act
 
 
 def keep_learning(batch: Batch) -> Findings:
@@ -322,12 +327,13 @@ def keep_learning(batch: Batch) -> Findings:
         "no change": {},
     }
     for title, plant in changes.items():
-        networks.weights = learnt_weights
-        networks.learning = True
-        learning_errors = mean_error(batch.run(networks, RUN_LENGTH, **SQUARE_WAVE, **plant))
-        networks.weights = learnt_weights
-        networks.learning = False
-        frozen_errors = mean_error(batch.run(networks, RUN_LENGTH, **SQUARE_WAVE, **plant))
+        errors = {}  # mean errors, by whether the weights learn
+        for learning in (True, False):
+            networks.weights = learnt_weights
+            networks.learning = learning
+            runs = batch.run(networks, RUN_LENGTH, **SQUARE_WAVE, **plant)
+            errors[learning] = mean_error(runs)
+        learning_errors, frozen_errors = errors[True], errors[False]
         at_most = math.inf  # Without a change, the number is for information only.
         if plant:
             at_most = 1 - NOTABLE_CHANGE

@@ -1,7 +1,7 @@
 """Run batches of the paper's neural controller and of PI controllers, and log weights."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from agents import DirectNNController, PIController
 from benchmarks.loop.measures import Agent, Trajectory, make_plants, rollout
+from mptc_gym.rollout import Act
 
 Array = NDArray[np.floating]
 
@@ -73,20 +74,14 @@ class Batch:
             num_envs=self.runs,
         )
 
-    def run(
-        self,
-        agent: Agent,
-        samples: int,
-        before: Callable[[int], object] | None = None,
-        **arguments: Any,
-    ) -> Trajectory:
+    def run(self, agent: Agent | Act, samples: int, **arguments: Any) -> Trajectory:
         """Run a controller on one plant for each run of the batch, and return all signals.
 
-        `samples` is the length of a run, and `arguments` are arguments of the environment. The
-        function `before` is called with the number k of each sample before the controller acts.
+        `agent` is a controller, or a function from observations to actions. `samples` is the
+        length of a run, and `arguments` are arguments of the environment.
         """
         plants = make_plants(self.runs, samples, **arguments)
-        return rollout(plants, agent, samples, self.seed, before)
+        return rollout(plants, agent, samples, self.seed)
 
     def run_nn(self, samples: int, **arguments: Any) -> Trajectory:
         """Run the paper's network, and return the signals of all runs of the batch."""
@@ -101,20 +96,23 @@ class Batch:
         batch = self if "noise_variance" in arguments else Batch(1, self.seed)
         return batch.run(PIController(gains["kp"], gains["ki"]), samples, **arguments)
 
+    def log_weights(self, samples: int, **arguments: Any) -> Array:
+        """Run the paper's network, and return its weights before each sample of each run.
 
-@dataclass
-class WeightLog:
-    """A function that logs the weights of learning networks before each sample of a run."""
+        The returned array has the shape (samples, runs, weights).
+        """
+        networks = self.networks()
+        log = []
 
-    networks: DirectNNController  # the learning networks, one for each run
-    # The weights before each sample so far: an array for each sample, shape (runs, weights).
-    weights: list[Array] = field(default_factory=list)
+        def act(observations: Any) -> Array:
+            """Log all weights, and return the actions of the networks."""
+            arrays = vars(networks.weights).values()
+            columns = [array.reshape(self.runs, -1) for array in arrays]
+            log.append(np.hstack(columns, dtype=np.float32))
+            return networks.act(observations)
 
-    def __call__(self, k: int) -> None:
-        """Append the weights of all networks, before they act at sample k, to `weights`."""
-        arrays = vars(self.networks.weights).values()
-        columns = [array.reshape(len(array), -1) for array in arrays]
-        self.weights.append(np.hstack(columns, dtype=np.float32))
+        self.run(act, samples, **arguments)
+        return np.array(log)
 
 
 def converged_at(weights: Array) -> Array:

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -123,13 +122,7 @@ def is_random(parameters: Parameters) -> bool:
     )
 
 
-def rollout(
-    plants: Any,
-    agent: Any,
-    samples: int,
-    seed: int,
-    before: Callable[[int], object] | None = None,
-) -> Trajectory:
+def rollout(plants: Any, agent: Any, samples: int, seed: int) -> Trajectory:
     """Reset a controller and a batch of plants, run them together, and return the signals.
 
     Parameters
@@ -144,19 +137,9 @@ def rollout(
     seed
         Seed of the first run. The environment draws the random numbers of run i, such as the
         noise, with the seed `seed + i`.
-    before
-        Function that is called with the sample number k before the controller acts at sample k,
-        for example to record the weights of a network.
     """
-    clock = itertools.count()
-    act_of_agent = start(agent, plants.num_envs)
-
-    def act(observations: Any) -> Any:
-        if before:
-            before(next(clock))
-        return act_of_agent(observations)
-
-    seeds = list(range(seed, seed + plants.num_envs))
+    act = start(agent, plants.num_envs)
+    seeds = range(seed, seed + plants.num_envs)
     signals = []
     steps = run_batch(plants, act, samples, seeds)
     for sample, next_sample in itertools.pairwise(steps):
