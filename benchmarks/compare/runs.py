@@ -5,6 +5,7 @@ A scenario is a plant, a set point and a length of the runs. The error of a run 
 processes, which need no pandas, as pandas takes long to import.
 """
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from benchmarks.bounds.least import LeastPossible, least_possible
 from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.statistics import percentiles
 from benchmarks.loop.linear import LinearController, LinearLoop, nominal
-from benchmarks.loop.measures import Trajectory, is_random, make_plants, measure, rollout
+from benchmarks.loop.measures import Trajectory, is_random, measure, rollout_together
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
 
@@ -68,13 +69,19 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     start = time.process_time()
     are_equal = not (controller.random or is_random(scenario.parameters))
     simulated_runs = 1 if are_equal else runs
-    sensitivity = None
+    members = [
+        member.start(scenario.arguments, simulated_runs, seed)
+        for member in controller.members()
+    ]
     trajectories = []
+    # The members of a user's controller may need different arguments of the environment.
+    for arguments, group in itertools.groupby(members, key=lambda member: member[1]):
+        agents = [agent for agent, _ in group]
+        trajectories += rollout_together(
+            agents, simulated_runs, scenario.samples, seed, **arguments
+        )
     tables = []
-    for number, member in enumerate(controller.members()):
-        agent, arguments = member.start(scenario.arguments, simulated_runs, seed)
-        plants = make_plants(simulated_runs, scenario.samples, **arguments)
-        trajectory = rollout(plants, agent, scenario.samples, seed)
+    for number, trajectory in enumerate(trajectories):
         columns: Columns = {
             "scenario": scenario.name,
             "agent": controller.name,
@@ -83,11 +90,12 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
         }
         for name, values in measure(trajectory, scenario.parameters).items():
             columns[name] = np.broadcast_to(values, runs)
-        trajectories.append(trajectory)
         tables.append(columns)
-        if isinstance(agent, LinearController):
-            loop = LinearLoop.of(agent, nominal(scenario.parameters))
-            sensitivity = loop.sensitivity()
+    first_agent, _ = members[0]
+    sensitivity = None
+    if isinstance(first_agent, LinearController):
+        loop = LinearLoop.of(first_agent, nominal(scenario.parameters))
+        sensitivity = loop.sensitivity()
     return Result(
         scenario=scenario.name,
         agent=controller.name,

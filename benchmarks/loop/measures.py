@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from mptc_gym import Parameters  # which registers the environment
 from mptc_gym.plant.dynamics import action_from_command, least_effective_command
 from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
+from mptc_gym.rollout import Act, start
 from mptc_gym.rollout import rollout as run_batch
-from mptc_gym.rollout import start
 
 Array = NDArray[np.float64]
 
@@ -69,9 +70,12 @@ class Trajectory:
     next_error: Array  # the error e(k + 1), degC, which determines the reward of step k
     next_setpoint: Array  # the set point y_d(k + 1), degC
 
-    def __getitem__(self, samples: slice) -> "Trajectory":
-        """Return the signals at a slice of the samples, such as `trajectory[-50:]`."""
-        return Trajectory(*(signal[samples] for signal in vars(self).values()))
+    def __getitem__(self, index: slice | tuple[slice, slice]) -> "Trajectory":
+        """Return the signals at some samples of some runs, such as `trajectory[-50:]`.
+
+        `index` is a slice of the samples, or a slice of the samples and a slice of the runs.
+        """
+        return Trajectory(*(signal[index] for signal in vars(self).values()))
 
 
 def make_plants(num_envs: int, samples: int, **arguments: Any) -> gymnasium.vector.VectorEnv:
@@ -138,8 +142,44 @@ def rollout(plants: Any, agent: Any, samples: int, seed: int) -> Trajectory:
         Seed of the first run. The environment draws the random numbers of run i, such as the
         noise, with the seed `seed + i`.
     """
-    act = start(agent, plants.num_envs)
     seeds = range(seed, seed + plants.num_envs)
+    return _run_batch(plants, start(agent, plants.num_envs), samples, seeds)
+
+
+def rollout_together(
+    agents: Sequence[Any], runs: int, samples: int, seed: int, **arguments: Any
+) -> list[Trajectory]:
+    """Run several controllers on the same episodes, and return the signals of each controller.
+
+    The result equals that of a `rollout` for each controller, but takes less time, since the
+    plants of all controllers are one batch.
+
+    Parameters
+    ----------
+    agents
+        Controllers, or policies in another form that `mptc_gym.evaluate` takes.
+    runs
+        Number of runs of each controller.
+    samples, seed
+        Arguments of `rollout`.
+    arguments
+        Arguments of the environment.
+    """
+    acts = [start(agent, runs) for agent in agents]
+
+    def act(observations: Any) -> Array:
+        """Return the actions of all controllers, each from the observations of its runs."""
+        shares = np.split(observations, len(acts))
+        return np.concatenate([act(share) for act, share in zip(acts, shares, strict=True)])
+
+    plants = make_plants(len(agents) * runs, samples, **arguments)
+    seeds = [*range(seed, seed + runs)] * len(agents)
+    trajectory = _run_batch(plants, act, samples, seeds)
+    return [trajectory[:, i : i + runs] for i in range(0, len(seeds), runs)]
+
+
+def _run_batch(plants: Any, act: Act, samples: int, seeds: Sequence[int]) -> Trajectory:
+    """Reset plants with `seeds`, run them with the actions of `act`, and return the signals."""
     signals = []
     steps = run_batch(plants, act, samples, seeds)
     for sample, next_sample in itertools.pairwise(steps):
