@@ -316,13 +316,17 @@ class LinearLoop:
 
     Attributes
     ----------
-    numerator, denominator : Array
-        Transfer function from the error e (degC) to the temperature y (degC), with the delay of
-        the plant: coefficients of z^0, z^-1 and so on.
+    denominator : Array
+        Denominator of the transfer function from the error e to the temperature y, with the
+        delay of the plant: coefficients of z^0, z^-1 and so on.
+    characteristic : Array
+        Characteristic polynomial, which is the numerator plus the denominator of the transfer
+        function: coefficients of z^0, z^-1 and so on. The zeros of the characteristic
+        polynomial in z are the poles of the loop.
     """
 
-    numerator: Array
     denominator: Array
+    characteristic: Array
 
     @classmethod
     def of(cls, controller: LinearController, plant: LinearModel) -> "LinearLoop":
@@ -333,15 +337,7 @@ class LinearLoop:
         zeros = np.zeros(round(plant.numbers.delay) + 1)
         numerator = np.convolve(controller_numerator, np.append(zeros, plant.beta))
         denominator = np.convolve(controller_denominator, np.append(1.0, -plant.alpha))
-        return cls(numerator, denominator)
-
-    @property
-    def characteristic(self) -> Array:
-        """Coefficients of z^0, z^-1, z^-2 and so on of the loop's characteristic polynomial.
-
-        The zeros of the characteristic polynomial in z are the poles of the loop.
-        """
-        return np.asarray(polyadd(self.denominator, self.numerator), np.float64)
+        return cls(denominator, np.asarray(polyadd(denominator, numerator)))
 
     def largest_pole(self) -> float:
         """Return the largest magnitude of a pole of the loop; below 1, the loop is stable."""
