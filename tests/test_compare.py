@@ -247,14 +247,20 @@ class TestCompare:
     def test_after_an_interruption_there_is_a_report_on_what_has_finished(
         self, compared, monkeypatch, capsys
     ):
-        result = run_case(SCENARIOS["load"], ROSTER["pi"], 1, 0)
-        monkeypatch.setattr(runs, "run_case", Mock(side_effect=[result, KeyboardInterrupt]))
-        out = compared("--agents pi --scenarios constant load --runs 1", status=130)
-        said = "interrupted: 1 of 4 tasks are missing"
-        assert f"**Unfinished: {said}.**" in (out / "report.md").read_text()
+        finished = [("pi", "constant"), ("pi", "load"), ("smith", "constant")]
+        results = [run_case(SCENARIOS[case], ROSTER[name], 1, 0) for name, case in finished]
+        monkeypatch.setattr(runs, "run_case", Mock(side_effect=[*results, KeyboardInterrupt]))
+        out = compared("--agents pi smith --scenarios constant load --runs 1", status=130)
+        said = "interrupted: 1 of 6 tasks are missing"
+        page = (out / "report.md").read_text()
+        assert f"**Unfinished: {said}.**" in page
         printed = capsys.readouterr()
         assert f"data and pictures are in {out}/" in printed.out
         assert said in printed.err
+        # The higher score is no better if it is over fewer cases.
+        assert page.index("| PI (1992)") < page.index("| Smith")
+        for text in (page, printed.out):
+            assert "Scores over fewer cases, as results are missing: Smith." in text
 
     def test_a_controller_may_have_any_name(self, compared):
         name = "$\\nope$ ../../x"

@@ -49,6 +49,17 @@ def test_scores_beyond_the_axis_stand_at_its_ends(figures, tmp_path):
     assert len(shown) == 2 * (2 + 1)
 
 
+def test_the_picture_of_scores_says_which_cases_are_missing(figures, tmp_path):
+    rows = [
+        {"scenario": case, "agent": agent, "scores": np.array([[0.5]])}
+        for agent, case in (("mpc", "a"), ("mpc", "b"), ("pi", "a"))
+    ]
+    scores = {agent: Estimate(0.5, 0.5, 0.5, 1) for agent in ("mpc", "pi")}
+    plots.plot_scores(scores, pd.DataFrame(rows), ROSTER, tmp_path / "scores.png")
+    labels = [label.get_text() for label in figures[0].axes[0].get_yticklabels()]
+    assert labels == ["MPC", "PI (1992)\n(1 of 2 cases)"]
+
+
 def responses(agent, outputs, spread=0.0):
     """Return responses over 80 minutes."""
     seconds = 8.0 * np.arange(600)

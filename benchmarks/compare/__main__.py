@@ -68,35 +68,28 @@ def work(options: Options) -> None:
     written before an error is raised.
     """
     from benchmarks.compare.report import write
-    from benchmarks.compare.runs import least_error, run_case
+    from benchmarks.compare.runs import Bound, Result, least_error, run_case
 
     chosen = choose("--agents", options.agents, ROSTER) | own_controllers(options.agent)
     controllers, note = that_fit(chosen, options.plant)
     folder_name, scenarios = cases(options)
+    runs, seed = options.runs, options.seed
     provenance = provenance_of(
         options={**asdict(options), "agents": list(controllers)},
-        seeds=list(range(options.seed, options.seed + options.runs)),
+        seeds=list(range(seed, seed + runs)),
         scenarios={name: vars(scenario) for name, scenario in scenarios.items()},
     )
     folder = new_folder(options.out, folder_name, provenance)
-    # Names of tasks are, for example, "bounds of square" and "mpc, square".
-    bound_tasks: dict[str, Any] = {}
-    run_tasks: dict[str, Any] = {}
-    for scenario in scenarios.values():
-        bound_task = partial(least_error, scenario, options.runs, options.seed)
-        bound_tasks[f"bounds of {scenario.name}"] = bound_task
+    tasks: dict[str, Any] = {}
+    for case, scenario in scenarios.items():
+        tasks[f"bounds of {case}"] = partial(least_error, scenario, runs, seed)
     for name, controller in controllers.items():
-        for scenario in scenarios.values():
-            run_task = partial(run_case, scenario, controller, options.runs, options.seed)
-            run_tasks[f"{name}, {scenario.name}"] = run_task
-    tasks = bound_tasks | run_tasks
-    # Long tasks start first, so that no core waits long at the end. The first argument of each
-    # task is a scenario.
-    task_names = sorted(tasks, key=lambda name: -tasks[name].args[0].samples)
-    sorted_tasks = {name: tasks[name] for name in task_names}
-    finished = options.fan_out.run(sorted_tasks, "compare")
-    results = [finished.results[name] for name in run_tasks if name in finished.results]
-    bounds = [finished.results[name] for name in bound_tasks if name in finished.results]
+        for case, scenario in scenarios.items():
+            tasks[f"{name}, {case}"] = partial(run_case, scenario, controller, runs, seed)
+    finished = options.fan_out.run(tasks, "compare")
+    outcomes = finished.results.values()
+    bounds = [outcome for outcome in outcomes if isinstance(outcome, Bound)]
+    results = [outcome for outcome in outcomes if isinstance(outcome, Result)]
     if results:
         table = write(results, bounds, controllers, folder, provenance, note, finished.error)
         print(f"{table}\nThe report, tables, data and pictures are in {folder}/")

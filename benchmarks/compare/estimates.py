@@ -96,13 +96,16 @@ def ranked(estimates: pd.DataFrame) -> dict[str, Estimate]:
     """Return the overall score of each controller by name, the highest score first.
 
     The overall score is the mean score over all scenarios, members and runs, with the 95 %
-    confidence interval of `bootstrap`.
+    confidence interval of `bootstrap`. A controller whose results are missing in a scenario
+    comes after those with more scenarios, since their scores cannot be compared.
     """
     scores = {
         str(agent): bootstrap(*tables, seed=BOOTSTRAP_SEED)
         for agent, tables in estimates.groupby("agent", sort=False)["scores"]
     }
-    return dict(sorted(scores.items(), key=lambda item: -item[1].value))
+    cases = estimates["agent"].value_counts()
+    order = sorted(scores, key=lambda agent: (-cases[agent], -scores[agent].value))
+    return {agent: scores[agent] for agent in order}
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:

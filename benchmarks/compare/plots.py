@@ -58,9 +58,10 @@ def plot_scores(
     path : Path
         The PNG file.
     """
-    labels = [controllers[agent].label for agent in scores]
-    values = [f"{score.value:.3f}" for score in scores.values()]
-    title = f"{labels[0]} has the highest score, {values[0]}"
+    best, *_ = scores
+    title = f"{controllers[best].label} has the highest score, {scores[best].value:.3f}"
+    cases = estimates["scenario"].nunique()
+    labels = []
     height = 1.5 + 0.3 * len(scores)  # inches: title and axis, and the rows
     with open_picture(path, height, title) as figure:
         axes = figure.subplots()
@@ -68,12 +69,15 @@ def plot_scores(
             colour, marker = controllers[agent].look
             scores_of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
             scenario_scores = [float(np.mean(values)) for values in scores_of_runs]
+            labels.append(controllers[agent].label)
+            if len(scenario_scores) < cases:
+                labels[row] += f"\n({len(scenario_scores)} of {cases} cases)"
             rows = np.full(len(scenario_scores), row)
             tick: Any = {"color": colour, "marker": "|", "ms": 9, "mew": 1.4, "ls": ""}
             axes.plot(distance(scenario_scores), rows, **tick)
             axes.plot(distance(score.value), row, color=colour, marker=marker, ms=6.5)
             right_of_axes = (1.01, row)
-            text = values[row]
+            text = f"{score.value:.3f}"
             axes.annotate(text, right_of_axes, xycoords=("axes fraction", "data"), va="center")
         axes.set_yticks(range(len(scores)), labels)
         axes.set_ylim(len(scores) - 0.5, -0.5)  # The first controller has the top row.

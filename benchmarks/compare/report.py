@@ -46,6 +46,10 @@ CASES_TEXT = (
     "other arguments have their default values. Figs are the figures of the paper by Cui and "
     "Shin (1992)."
 )
+PICTURES_TEXT = (
+    "To remain readable, the pictures show only {}. The file CASE.csv of a case has the "
+    "temperature and the flow of all controllers."
+)
 SCREEN_TEXT = "score: 0 idle valve, 1 least possible error; cases: error / least possible error"
 LONGEST_LABEL = 16  # largest number of characters of a controller's label on the screen
 # Of more controllers than `MOST_PICTURED`, the pictures of responses over time show only users'
@@ -106,7 +110,7 @@ def write(
     for name in runs["scenario"].unique():
         columns = [result.responses for result in results if result.scenario == name]
         responses[name] = pd.concat(map(pd.DataFrame, columns))
-        write_numbers(folder / f"{name}.csv", responses[name])
+        responses[name].to_csv(folder / f"{name}.csv", index=False)
     # The report has the scenarios with both results and least possible errors.
     bounds = [bound for bound in bounds if bound.scenario.name in responses]
     runs = runs[runs["scenario"].isin([bound.scenario.name for bound in bounds])]
@@ -119,12 +123,14 @@ def write(
     plots.plot_scores(scores, estimates, controllers, folder / "scores.png")
     for scenario, _ in bounds:
         rows = responses[scenario.name]
-        rows = rows[rows["agent"].isin(pictured(scores))]
-        # If the tasks of all pictured controllers have failed, `rows` is empty.
-        if not rows.empty:
-            errors = runs[runs["scenario"] == scenario.name].groupby("agent")["mae"].mean()
-            path = folder / f"{scenario.name}.png"
-            plots.plot_responses(rows, errors, scenario, controllers, path)
+        rows = rows[rows["agent"].isin(pictured(rows["agent"].unique()))]
+        errors = runs[runs["scenario"] == scenario.name].groupby("agent")["mae"].mean()
+        path = folder / f"{scenario.name}.png"
+        plots.plot_responses(rows, errors, scenario, controllers, path)
+    finished_cases = estimates["agent"].value_counts()
+    labels = [controllers[name].label for name in scores if finished_cases[name] < len(bounds)]
+    if labels:
+        note += f" Scores over fewer cases, as results are missing: {', '.join(labels)}."
     page = sections(comparison, note)
     write_report(folder, "Comparison of controllers", page, provenance, error)
     return "\n".join(filter(None, [on_screen(comparison), note]))
@@ -133,14 +139,20 @@ def write(
 def pictured(agents: Iterable[str]) -> list[str]:
     """Return the names of the controllers whose temperature and flow are drawn."""
     names = list(agents)
-    chosen = [name for name in names if name in PICTURED or name not in ROSTER]
-    return chosen if len(names) > MOST_PICTURED and chosen else names
+    if len(names) <= MOST_PICTURED:
+        return names
+    return [name for name in names if name in PICTURED or name not in ROSTER]
 
 
 def sections(comparison: Comparison, note: str) -> list[Section]:
     """Return the sections of a comparison's report, with `note` in the first section."""
     scenarios = [scenario for scenario, _ in comparison.bounds]
     table = score_table(comparison, format)
+    cases_text = [CASES_TEXT]
+    drawn = pictured(comparison.scores)
+    if len(drawn) < len(comparison.scores):
+        labels = [comparison.controllers[name].label for name in drawn]
+        cases_text.append(PICTURES_TEXT.format(", ".join(labels)))
     return [
         Section(
             "Score and error ratios",
@@ -151,7 +163,7 @@ def sections(comparison: Comparison, note: str) -> list[Section]:
         Section("What each controller knows and costs", [COSTS_TEXT], costs_table(comparison)),
         Section(
             "Cases",
-            [CASES_TEXT],
+            cases_text,
             cases_table(scenarios),
             pictures={
                 f"{scenario.name}.png": f"Temperature and flow over time: {scenario.title}"
