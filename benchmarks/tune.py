@@ -7,6 +7,7 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -141,10 +142,10 @@ def finals(
     spans
         Interval in which gains were searched, by the gain's name.
     trials
-        Trials of the search.
+        Trials of the search, whose value is the objective.
     """
     rows: list[dict[str, Any]] = []
-    for trial in sorted(trials, key=lambda trial: float(trial.value or 0.0))[:FINALISTS]:
+    for trial in sorted(trials, key=attrgetter("value"))[:FINALISTS]:
         gains = gains_of(trial.params, spans)
         rounded = {gain: float(f"{value:.3g}") for gain, value in gains.items()}
         scores = score(name, plant, rounded, FINAL_RUNS, FINAL_FIRST_RUN)

@@ -191,11 +191,11 @@ def _bound(
     if not is_random(parameters):
         episodes = 1
     sampled = _episodes_of(parameters, samples, episodes, seed)
-    bounds = episodes
+    different_bounds = episodes
     if not (parameters.ranges or parameters.setpoint == "random"):
-        bounds = 1  # Noise and load do not change the bound.
+        different_bounds = 1  # Noise and load do not change the bound.
     values = []
-    for i in range(bounds):
+    for i in range(different_bounds):
         error_sum = _error_sum(parameters, kind, sampled.numbers[i], sampled.setpoints[i])
         # Solvers differ between machines in later digits.
         values.append(round(error_sum / samples, 6))

@@ -234,6 +234,7 @@ def _program(
     signs = scipy.sparse.hstack([eye, -eye] * len(slopes))
     blocks = [[A[first:, first:], -B[first:, count:-1], None], [eye, None, signs]]
     right = [np.zeros(n), error_of_past[first:]]
+    # For each slope, n lengths for the positive pieces, and the same for the negative pieces.
     lengths = np.repeat(bounds.lengths[first:samples], 2, axis=1).T.ravel()
     costs = [np.zeros(n), price[count:-1], np.repeat(slopes, 2 * n)]
     low = [np.full(n, -np.inf), np.full(n, model.limits[0]), np.zeros(len(lengths))]

@@ -151,6 +151,7 @@ def load_changes(model: LinearModel) -> LoadChanges:
     largest_count = math.ceil(min(model.lag, samples) / LOAD_INTERVAL)
     effects = np.empty((samples, largest_count))
     for place in range(largest_count):  # Column 0 is for the latest change.
+        # Column 0 of `responses` is 0, so it stands for changes that do not exist.
         effects[:, place] = responses[k, np.maximum(changes - place, 0)]
     return LoadChanges(effects, changes - known_changes, known_changes)
 

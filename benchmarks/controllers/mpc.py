@@ -199,6 +199,7 @@ class PredictiveController:
         start = np.vstack([self._plan[1:], self._plan[-1:]])
         plan = self._optimise(model, slopes, start)
         self._plan, command = self._avoid_dead_zone(model, slopes, plan)
+        # The next call is for sample k + 1, from which each flow is a sample farther back.
         self._flows[:, 2:] = self._flows[:, 1:-1].copy()
         self._flows[:, 1] = self._plan[0]
         self._k += 1
@@ -252,6 +253,7 @@ class PredictiveController:
         plants = self._model(self._k).plants
         F, Q = self._transition(self._k, plants)
         state = np.einsum("nij,nj->ni", F, self._state)
+        # The past flows that the coefficients of B multiply in the equation of y(k).
         flows = np.take_along_axis(self._flows, self._flow_columns[:, 0], axis=1)
         state[:, 0] += (flows * plants.beta).sum(axis=1)
         gain, self._covariance = self._gain_and_covariance(self._covariance, F, Q)
@@ -294,6 +296,8 @@ class PredictiveController:
         longest delay of a run in samples.
         """
         runs = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
+        # The past flow that each coefficient of B multiplies in the equation of each forecast
+        # output, or 0; shape (runs, outputs, coefficients of B).
         flows = self._flows[runs, self._flow_columns[:, 1:]]
         models = [self._model(self._k + 1 + i).plants for i in range(flows.shape[1])]
         flows *= np.stack([plants.beta for plants in models], axis=1)

@@ -233,6 +233,7 @@ class Plants(VecEnv):
             )
             for plants in recipe.plants
         ]
+        # Shape (length of an observation, number of inputs of the policy).
         self._features = features(recipe).T.astype(np.float32)
         observation_space = Box(-np.inf, np.inf, self._features.shape[1:])
         num_envs = sum(batch.num_envs for batch in self.batches)
@@ -247,7 +248,8 @@ class Plants(VecEnv):
         offset = int(np.random.SeedSequence(seed).generate_state(1)[0])  # below 2**32
         seeds: list[int | None] = []
         for batch in self.batches:
-            seeds += batch.seed(TRAINING_SEEDS + offset + len(seeds) // GROUP)
+            earlier_groups = len(seeds) // GROUP  # in the batches before this one
+            seeds += batch.seed(TRAINING_SEEDS + offset + earlier_groups)
         return seeds
 
     def reset(self) -> NDArray[Any]:
