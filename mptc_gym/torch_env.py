@@ -49,7 +49,7 @@ from mptc_gym.plant.parameters import ARGUMENTS, Parameters, PlantNumbers, full_
 from mptc_gym.plant.signals import LOAD_INTERVAL, SetPointLevels, noise_polynomials
 
 Number = float | Tensor  # a float for all plants, or an element for each plant, shape (n,)
-Age = int | Tensor  # sample number k of all plants, or of each plant, shape (n,)
+SampleNumber = int | Tensor  # of all plants, or of each plant, shape (n,)
 
 MOST_BLOCK_SAMPLES = 64  # most samples in a block, which bounds the memory of a block
 # On a CPU, the most values of a signal in a block of more than `DRIFT_INTERVAL` samples:
@@ -73,11 +73,11 @@ def _uniform(low: float, high: float, zeros: Tensor, generator: torch.Generator)
 class _Signal:
     """A signal of n plants, whose random numbers come from the environment's generator.
 
-    Every subclass has two methods. `reset(mask, age, numbers)` begins an episode of the plants
-    in `mask`, which have the parameter values `numbers`, and returns the values at the present
-    sample, degC, shape (n,); `age` is the present sample number k. `next(samples, age)` returns
-    the values at the next samples, degC, shape (samples, n); `age` is the sample number k of
-    the first of these samples. No load changes after this first sample.
+    Every subclass has two methods. `reset(mask, k, numbers)` begins an episode of the plants in
+    `mask`, which have the parameter values `numbers`, and returns the values at the present
+    sample k, degC, shape (n,). `next(samples, k)` computes a block of successive samples,
+    beginning with sample k, and returns the values, degC, shape (samples, n). No load changes
+    after the first sample of a block.
     """
 
     def __init__(self, zeros: Tensor, generator: torch.Generator) -> None:
@@ -85,8 +85,8 @@ class _Signal:
         self._generator = generator
         self._uniform = functools.partial(_uniform, zeros=zeros, generator=generator)
 
-    def advance(self) -> None:
-        """Make the next sample of the block the present sample."""
+    def end_block(self, samples: int) -> None:
+        """Forget the latest block, except for its first samples, which steps have returned."""
 
 
 class _Noise(_Signal):
@@ -99,28 +99,27 @@ class _Noise(_Signal):
         super().__init__(*args)
         self._variance_name = f"{name}_variance"
         self._c = c
-        self._past_xi = deque([self._zeros] * (len(c) - 1), len(c) - 1)  # the oldest first
-        self._coming_xi: list[Tensor] = []  # in the rest of the block, the next sample last
+        # White noise of the samples before the latest block, which C needs, and of the block.
+        self._xi = [self._zeros] * (len(c) - 1)
 
-    def reset(self, mask: Tensor, age: Age, numbers: PlantNumbers[Any]) -> Tensor:
+    def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
         self._deviation = getattr(numbers, self._variance_name) ** 0.5
-        self._past_xi.extend([xi.masked_fill(mask, 0.0) for xi in self._past_xi])
+        self._xi = [xi.masked_fill(mask, 0.0) for xi in self._xi]
         return self._zeros
 
-    def next(self, samples: int, age: Age) -> Tensor:
+    def next(self, samples: int, k: SampleNumber) -> Tensor:
         new_xi = self._zeros.new_empty(samples, len(self._zeros))
         new_xi.normal_(generator=self._generator).mul_(self._deviation)
-        rows = new_xi.unbind()
-        self._coming_xi = [*rows[::-1]]
-        xi = torch.stack([*self._past_xi, *rows])
+        self._xi += new_xi.unbind()
+        xi = torch.stack(self._xi)
         noise = new_xi
         for lag, coefficient in enumerate(self._c[1:], start=1):
-            first = len(self._past_xi) - lag
+            first = len(self._c) - 1 - lag
             noise = noise.add(xi[first : first + samples], alpha=coefficient)
         return noise
 
-    def advance(self) -> None:
-        self._past_xi.append(self._coming_xi.pop())
+    def end_block(self, samples: int) -> None:
+        self._xi = self._xi[samples : samples + len(self._c) - 1]
 
 
 class _RepeatedSetPoint(_Signal):
@@ -133,13 +132,13 @@ class _RepeatedSetPoint(_Signal):
         self._ends = torch.tensor(levels.lengths, device=self._levels.device).cumsum(0)
         self._period = sum(levels.lengths)
 
-    def reset(self, mask: Tensor, age: Age, numbers: PlantNumbers[Any]) -> Tensor:
+    def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
         return self._levels[0].expand(len(mask))
 
-    def next(self, samples: int, age: Age) -> Tensor:
+    def next(self, samples: int, k: SampleNumber) -> Tensor:
         rows = torch.arange(samples, device=self._ends.device)[:, None]
         # The index of the level is the number of ends that a sample has reached.
-        indices = torch.bucketize((age + rows) % self._period, self._ends, right=True)
+        indices = torch.bucketize((k + rows) % self._period, self._ends, right=True)
         return self._levels[indices].expand(-1, len(self._zeros))
 
 
@@ -157,19 +156,19 @@ class _RandomSetPoint(_Signal):
         # The sample numbers k at which the present and the next level end.
         self._end = self._next_end = self._zeros.to(torch.int64)
 
-    def reset(self, mask: Tensor, age: Age, numbers: PlantNumbers[Any]) -> Tensor:
-        self._begin_next_levels(age)
+    def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
+        self._begin_next_levels(k)
         levels, lengths = self._draw()
         self._level = torch.where(mask, levels, self._level)
         self._end = torch.where(mask, lengths, self._end)
         return self._level
 
-    def next(self, samples: int, age: Age) -> Tensor:
-        self._begin_next_levels(age - 1)
+    def next(self, samples: int, k: SampleNumber) -> Tensor:
+        self._begin_next_levels(k - 1)
         self._next_level, lengths = self._draw()
         self._next_end = self._end + lengths
-        ages = age + torch.arange(samples, device=self._end.device)[:, None]
-        return torch.where(ages >= self._end, self._next_level, self._level)
+        rows = torch.arange(samples, device=self._end.device)[:, None]
+        return torch.where(k + rows >= self._end, self._next_level, self._level)
 
     def _draw(self) -> tuple[Tensor, Tensor]:
         """Return random levels, degC, and their durations, samples, both of shape (n,)."""
@@ -177,9 +176,9 @@ class _RandomSetPoint(_Signal):
         levels = self._uniform(-distribution.amplitude, distribution.amplitude)
         return levels, self._uniform(distribution.shortest, distribution.longest)
 
-    def _begin_next_levels(self, age: Age) -> None:
-        """Make the next level the present level of each plant whose present level has ended."""
-        has_ended = self._end <= age
+    def _begin_next_levels(self, k: SampleNumber) -> None:
+        """Make the next level the present level of each plant whose level has ended at k."""
+        has_ended = self._end <= k
         self._level = torch.where(has_ended, self._next_level, self._level)
         self._end = torch.where(has_ended, self._next_end, self._end)
 
@@ -191,14 +190,14 @@ class _Load(_Signal):
         super().__init__(*args)
         self._level = self._walk = self._zeros  # a level that jumps, and a random walk, degC
 
-    def reset(self, mask: Tensor, age: Age, numbers: PlantNumbers[Any]) -> Tensor:
+    def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
         self._numbers = numbers
         self._level = self._level.masked_fill(mask, 0.0)
         self._walk = self._walk.masked_fill(mask, 0.0)
         return self._zeros
 
-    def next(self, samples: int, age: Age) -> Tensor:
-        is_due = age % LOAD_INTERVAL == 0
+    def next(self, samples: int, k: SampleNumber) -> Tensor:
+        is_due = k % LOAD_INTERVAL == 0
         # A tensor is not tested, as the test would wait for the device.
         if isinstance(is_due, Tensor) or is_due:
             numbers = self._numbers
@@ -263,31 +262,32 @@ class _Plants:
         self._limits = parameters.lowest.u_min, parameters.lowest.u_max
         self._half_range = (self._limits[1] - self._limits[0]) / 2.0
         self._middle = zeros.new_tensor(sum(self._limits) / 2.0)
-        shortest_delay, self._longest_delay = map(int, parameters.range_of("delay"))
-        self.most_samples = shortest_delay + 1
-        # The applied flows that terms of the polynomial B still need, t/h, the oldest first.
+        self._shortest_delay, self._longest_delay = map(int, parameters.range_of("delay"))
+        self.most_samples = self._shortest_delay + 1
+        # The applied flows that terms of the polynomial B still need, t/h, the oldest first:
+        # the first is u_a(k-d) for the longest delay d and the last term of B.
         flows = self._longest_delay + len(parameters.b)
         self._flows = deque([zeros] * flows, flows)
-        order = len(parameters.a) - 1
-        self._past_outputs = deque([zeros] * order, order)  # temperatures, degC, oldest first
-        self._coming_outputs: list[Tensor] = []  # in the rest of the block, the next last
+        # Temperatures of the samples before the latest block, which A needs, and of the block.
+        self._outputs = [zeros] * (len(parameters.a) - 1)
 
-    def reset(self, mask: Tensor, age: Age, numbers: PlantNumbers[Any]) -> None:
+    def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> None:
         """Bring the plants in `mask` to rest, with the parameter values `numbers`."""
         self._numbers = numbers
-        for rows in (self._flows, self._past_outputs):
-            rows.extend([row.masked_fill(mask, 0.0) for row in rows])  # pushes out the old rows
+        self._outputs = [row.masked_fill(mask, 0.0) for row in self._outputs]
+        self._flows.extend([row.masked_fill(mask, 0.0) for row in self._flows])  # replaces all
         # A command is scaled to an action and back in up to eight operations, each with a
         # relative error of at most half an eps.
         rounding = 4.0 * torch.finfo(self._zeros.dtype).eps
         self._edge: Number = least_effective_command(numbers.dead_zone, *self._limits, rounding)
-        if isinstance(numbers.delay, Tensor):  # `_response` reads the flows at these rows
-            rows_of_block = self.most_samples + len(self._parameters.b) - 1
+        if isinstance(numbers.delay, Tensor):
+            # The rows of `_flows` to which each plant responds in a block of `most_samples`.
+            # With a shorter delay, these are later flows, in later rows.
             first_rows = self._longest_delay - numbers.delay.to(torch.int64)
-            self._delayed_rows = (
-                first_rows + torch.arange(rows_of_block, device=mask.device)[:, None]
-            )
-        self._update_dynamics(age)
+            rows_of_block = self._shortest_delay + len(self._parameters.b)
+            rows = torch.arange(rows_of_block, device=mask.device)[:, None]
+            self._delayed_rows = first_rows + rows
+        self._update_dynamics(k)
 
     def apply(self, a: Tensor) -> tuple[Tensor, Tensor]:
         """Apply the normalised actions a(k), shape (n,).
@@ -313,44 +313,41 @@ class _Plants:
         self._flows.append(applied.clone())  # a copy, as the caller may overwrite `applied`
         return command, applied
 
-    def next(self, samples: int, age: Age, noise: Tensor, load: Tensor | None) -> Tensor:
+    def next(self, samples: int, k: SampleNumber, noise: Tensor, load: Tensor | None) -> Tensor:
         """Return the temperatures y at the next samples, degC, shape (samples, n).
 
-        `samples` is at most `most_samples`, and `age` is the sample number k of the first of
-        these samples, which follows the latest action. `noise` and `load` hold the coloured
+        `samples` is at most `most_samples`, and k is the first of these samples, which follows
+        the latest action. `noise` and `load` hold the coloured
         noise n and the load w, degC, shape (samples, n); None is a load that is always 0.
         """
         if self._parameters.drifts:
-            self._update_dynamics(age)
+            self._update_dynamics(k)
         # The temperatures without the terms of earlier temperatures.
         forced = _add_product(noise, self._scale, self._response(samples))
         if load is not None:
             forced = _add_product(forced, self._load_gain, load)
-        outputs = [*self._past_outputs]
         for output in forced.unbind():
             for lag, alpha in enumerate(self._alpha, start=1):
-                output = _add_product(output, alpha, outputs[-lag])
-            outputs.append(output)
-        new_outputs = outputs[-samples:]
-        self._coming_outputs = new_outputs[::-1]
-        return torch.stack(new_outputs)
+                output = _add_product(output, alpha, self._outputs[-lag])
+            self._outputs.append(output)
+        return torch.stack(self._outputs[-samples:])
 
-    def advance(self) -> None:
-        """Make the next sample of the block the present sample."""
-        self._past_outputs.append(self._coming_outputs.pop())
+    def end_block(self, samples: int) -> None:
+        """Forget the latest block, except for its first samples, which steps have returned."""
+        order = len(self._parameters.a) - 1
+        self._outputs = self._outputs[samples : samples + order]
 
     def detach(self) -> None:
         """Cut the gradient graph of earlier actions."""
-        for rows in (self._flows, self._past_outputs):
-            rows.extend([row.detach() for row in rows])
-        self._coming_outputs = [row.detach() for row in self._coming_outputs]
+        self._outputs = [row.detach() for row in self._outputs]
+        self._flows.extend([row.detach() for row in self._flows])  # replaces all
 
-    def _update_dynamics(self, age: Age) -> None:
-        """Update the coefficients of equation (28) to the sample number k = `age`."""
-        age_at_change = age - age % DRIFT_INTERVAL
-        if isinstance(age_at_change, Tensor):
-            age_at_change = age_at_change.to(self._zeros.dtype)
-        factors = self._dynamics.factors(self._numbers, age_at_change)
+    def _update_dynamics(self, k: SampleNumber) -> None:
+        """Update the coefficients of equation (28) to the latest change up to sample k."""
+        k_of_change = k - k % DRIFT_INTERVAL
+        if isinstance(k_of_change, Tensor):
+            k_of_change = k_of_change.to(self._zeros.dtype)
+        factors = self._dynamics.factors(self._numbers, k_of_change)
         self.factors = [self._zeros + factor for factor in factors]
         self._alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
 
@@ -359,8 +356,8 @@ class _Plants:
         beta = self._parameters.b
         # One delayed flow for each sample, and earlier flows for the further terms of B.
         rows = samples + len(beta) - 1
-        rows_of_all = rows + self._longest_delay + 1 - self.most_samples
-        flows = torch.stack([*islice(self._flows, rows_of_all)])
+        rows_of_all_delays = rows + self._longest_delay - self._shortest_delay
+        flows = torch.stack([*islice(self._flows, rows_of_all_delays)])
         if isinstance(self._numbers.delay, Tensor):
             flows = flows.gather(0, self._delayed_rows[:rows])
         response = self._zeros
@@ -551,7 +548,7 @@ class MiddlePointTorchEnv(BatchEnv):
         # Parameter values of the plants; a range is replaced by an element for each plant.
         self._numbers: dict[str, Any] = dict(vars(parameters.lowest))
         self._numbers |= dict.fromkeys(parameters.ranges, self._zeros)
-        self._start: Age = 0  # clock at k = 0 of all plants or of each plant
+        self._start: SampleNumber = 0  # clock at k = 0 of all plants or of each plant
         self._changes: list[int] = []  # clocks at which load or dynamics change, modulo 10
         levels = SetPointLevels(parameters)
         setpoint = _RandomSetPoint if levels.random else _RepeatedSetPoint
@@ -564,6 +561,7 @@ class MiddlePointTorchEnv(BatchEnv):
         self._plants = _Plants(parameters, self._zeros)
         self._wanted_flows = _WantedFlows(parameters, self._zeros)  # for the form "change"
         self._window = _Window(parameters.windows, self._zeros)
+        self._block_samples = 0  # number of samples in the latest block
         # What the remaining steps of the block return, by name, the next step last.
         self._ahead: list[Infos] = []
         self._most_samples = min(MOST_BLOCK_SAMPLES, self._plants.most_samples)
@@ -609,8 +607,6 @@ class MiddlePointTorchEnv(BatchEnv):
         command, applied = self._plants.apply(a)
         if not self._ahead:
             self._compute_block()
-        for part in (self._plants, *self._signals.values()):
-            part.advance()
         infos = self._ahead.pop()
         observations = self._window.add(*[infos.pop(name) for name in OBSERVED], a)
         rewards = infos.pop("rewards")
@@ -624,16 +620,22 @@ class MiddlePointTorchEnv(BatchEnv):
 
     def _compute_block(self) -> None:
         """Compute what the present step and the next steps return, up to an episode's end."""
-        # The rows after the next end of an episode would be dropped, and computed again.
+        self._end_block()
+        # The rows after the next end of an episode would be dropped, and computed again. While
+        # a reset is pending, that end has passed.
         samples = max(1, min(self._most_samples, self._next_end - self._clock + 1))
+        # Load and dynamics may change at the first sample of the block, which is the present
+        # clock, but not at later samples of the block.
         for change in self._changes:
-            samples = min(samples, (change - self._clock - 1) % DRIFT_INTERVAL + 1)
-        age = self._clock - self._start
-        blocks = {name: signal.next(samples, age) for name, signal in self._signals.items()}
+            samples_to_change = (change - self._clock - 1) % DRIFT_INTERVAL + 1  # 1 to 10
+            samples = min(samples, samples_to_change)
+        self._block_samples = samples
+        k = self._clock - self._start
+        blocks = {name: signal.next(samples, k) for name, signal in self._signals.items()}
         if "noise" not in blocks:
             blocks["noise"] = self._zeros.new_zeros(samples, self.num_envs)
         setpoint = blocks["setpoint"]
-        output = self._plants.next(samples, age, blocks["noise"], blocks.get("disturbance"))
+        output = self._plants.next(samples, k, blocks["noise"], blocks.get("disturbance"))
         reading = output + blocks.pop("measurement_noise", 0.0)
         span = self.parameters.temperature_span
         reading = reading.clamp(-span, span)
@@ -651,8 +653,15 @@ class MiddlePointTorchEnv(BatchEnv):
         shared: Infos = {f"_{name}": everyone for name in self._info_names}
         if self.parameters.drifts:
             shared |= zip(FACTORS, self._plants.factors, strict=True)
-        for k in reversed(range(samples)):
-            self._ahead.append({name: values[k] for name, values in rows.items()} | shared)
+        for i in reversed(range(samples)):
+            self._ahead.append({name: values[i] for name, values in rows.items()} | shared)
+
+    def _end_block(self) -> None:
+        """Drop the samples of the latest block that no step has returned."""
+        for part in (self._plants, *self._signals.values()):
+            part.end_block(self._block_samples - len(self._ahead))
+        self._ahead = []
+        self._block_samples = 0
 
     def _rewards(self, error: Tensor) -> Tensor:
         """Return the rewards for control errors, degC, without the cost of changed actions."""
@@ -670,26 +679,26 @@ class MiddlePointTorchEnv(BatchEnv):
         tensor of shape (num_envs,), in which the elements of plants outside `mask` have no
         meaning.
         """
-        self._ahead = []
+        self._end_block()
         if mask.all():
             self.detach()
         flags = self._as_array(mask)
         starts = self._starts
         self._start = self._clock if (starts == self._clock).all() else self._as_array(starts)
         if self.parameters.is_disturbed or self.parameters.drifts:
-            # Load and dynamics change at sample numbers k that are multiples of 10. Python
-            # numbers, as reading a tensor would wait for the device.
+            # Load and dynamics of a plant change when its sample number k is a multiple of 10.
+            # These are Python numbers, as reading a tensor would wait for the device.
             self._changes = np.unique(starts % DRIFT_INTERVAL).tolist()
-        age = self._clock - self._start
+        k = self._clock - self._start
         infos: dict[str, Tensor] = {}
         for name, (low, high) in self.parameters.ranges.items():
             infos[name] = _uniform(low, high, self._zeros, self._generator)
             self._numbers[name] = torch.where(flags, infos[name], self._numbers[name])
         numbers = PlantNumbers(**self._numbers)
-        self._plants.reset(flags, age, numbers)
+        self._plants.reset(flags, k, numbers)
         self._wanted_flows.reset(flags)
         first_values = {
-            name: signal.reset(flags, age, numbers) for name, signal in self._signals.items()
+            name: signal.reset(flags, k, numbers) for name, signal in self._signals.items()
         }
         setpoint = first_values["setpoint"]
         rest_action = self._zeros + action_from_command(0.0, numbers.u_min, numbers.u_max)

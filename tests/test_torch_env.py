@@ -76,14 +76,14 @@ class ReplayedSignal:
     def __init__(self, env, name):
         self.env, self.name = env, name
 
-    def reset(self, mask, age, numbers):
+    def reset(self, mask, k, numbers):
         return self.env.now(self.name, 0)
 
-    def next(self, samples, age):
+    def next(self, samples, k):
         last = self.env.replay[self.name].shape[1] - 1  # steps that reset may lead beyond it
-        return self.env.now(self.name, (age + torch.arange(samples)[:, None]).clamp(max=last))
+        return self.env.now(self.name, (k + torch.arange(samples)[:, None]).clamp(max=last))
 
-    def advance(self):
+    def end_block(self, samples):
         pass
 
 
