@@ -143,7 +143,7 @@ def work(options):
     tasks = {name: partial(time.sleep, options.seconds) for name in "abcd"}
     finished = options.fan_out.run({"up": partial(print, "up", flush=True)} | tasks, "tasks")
     (folder / "report.md").write_text(f"{len(finished.results)} of 5")
-    import matplotlib.pyplot
+    import matplotlib
     print("5 \N{DEGREE SIGN}C")
     if finished.error:
         raise finished.error
@@ -177,7 +177,7 @@ def test_after_a_stop_what_has_finished_is_written(send, number, tmp_path):
     ("surroundings", "last_line"),
     [
         ({"PYTHONIOENCODING": "ascii"}, "5 ?C\n"),
-        ({"MPLBACKEND": "module://no_such_notebook.backend"}, "5 \N{DEGREE SIGN}C\n"),
+        ({"MPLBACKEND": "module://matplotlib_inline.backend_inline"}, "5 \N{DEGREE SIGN}C\n"),
     ],
 )
 def test_the_surroundings_of_the_caller_stop_no_command(surroundings, last_line, tmp_path):

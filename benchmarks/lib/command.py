@@ -7,6 +7,7 @@ imported inside the function `work`, so that `--help` is quick.
 """
 
 import inspect
+import os
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -170,8 +171,10 @@ def command(
 
 
 def _ignore_surroundings() -> None:
-    """Make a command independent of the scheduler or terminal that calls it."""
+    """Make a command independent of the notebook, terminal or scheduler that calls it."""
     # A scheduler stops a command by SIGTERM, which else would leave processes that run tasks.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # A notebook names a backend that need not be installed here, which matplotlib refuses.
+    os.environ["MPLBACKEND"] = "agg"
     # A terminal without Unicode shows "?" in place of a degree sign.
     sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
