@@ -233,18 +233,8 @@ class Dynamics:
             quotient, _remainder = np.polydiv(parameters.a, [1.0, -pole])
             self._quotient = [*quotient.tolist(), 0.0]
 
-    def drift_share(self, age: Any) -> Any:
-        """Return the share of the drift of gain and time constant that is complete.
-
-        The complete share of a drift grows linearly from 0 at sample k = 0 to 1 at sample k =
-        `drift_samples`, and is 1 afterwards. `age` is the present sample k: a number, or an
-        array or tensor with one element per plant. The returned share has the shape of `age`.
-        """
-        share = age / self._drift_samples
-        return share * (share < 1.0) + (share >= 1.0)  # at most 1, for arrays of any library
-
-    def factors(self, numbers: PlantNumbers[Any], age: Any) -> tuple[Any, Any]:
-        """Return the gain factor g and the time constant factor t at sample k = `age`.
+    def factors(self, numbers: PlantNumbers[Any], k: Any) -> tuple[Any, Any]:
+        """Return the gain factor g and the time constant factor t at sample k.
 
         g is the steady-state gain divided by the gain of the arguments `a` and `b`, and t is
         the time constant divided by the time constant of the argument `a`. g and t are floats,
@@ -254,11 +244,13 @@ class Dynamics:
         ----------
         numbers
             Parameter values of the plants, such as `gain_factor` and `gain_drift`.
-        age
+        k
             Number of samples since the start of the episode: a number, or an array or tensor
             with one element per plant.
         """
-        share = self.drift_share(age)
+        # The share of the drift that is complete: it grows linearly to 1 at `drift_samples`.
+        share = k / self._drift_samples
+        share = share * (share < 1.0) + (share >= 1.0)  # at most 1, for arrays of any library
         gain = numbers.gain_factor
         time_constant = numbers.time_constant_factor
         return (
@@ -333,7 +325,7 @@ class Plant:
         )
         self._drifts = parameters.drifts
         self.factors: dict[str, float] = {}
-        self._age = 0
+        self._k = 0
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()
         # Past temperatures and applied flows, the newest first.
@@ -363,8 +355,8 @@ class Plant:
             Commanded flow u(k) and applied flow u_a(k), t/h, and temperature y(k+1), degC.
         """
         if self._drifts:
-            self._age += 1
-            if self._age % DRIFT_INTERVAL == 0:
+            self._k += 1
+            if self._k % DRIFT_INTERVAL == 0:
                 self._update_dynamics()
         # The last formula of the paper's Section 4 scales the outputs of a neural network, from
         # 0 to 1, to flows. Here, the formula is rewritten for actions from -1 to 1.
@@ -395,7 +387,7 @@ class Plant:
 
     def _update_dynamics(self) -> None:
         """Update the plant's coefficients and drift factors to the present sample."""
-        factors = self._dynamics.factors(self._numbers, self._age)
+        factors = self._dynamics.factors(self._numbers, self._k)
         if self._drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
@@ -440,9 +432,7 @@ class PlantBatch:
         # plant's episode, and the time at which the next drifting gain or time constant
         # changes.
         self._clock = 0
-        self._starts: NDArray[np.int64] = np.zeros((), np.int64)
-        if parameters.drifts:
-            self._starts = np.zeros(num_envs, np.int64)
+        self._starts = np.zeros(num_envs, np.int64)
         self._next_update = 0
         self.factors: dict[str, Values] = {}
         self._update_dynamics()
@@ -465,8 +455,7 @@ class PlantBatch:
             getattr(self.numbers, name)[plants] = values
         if ranges:
             self._update_actuator()
-        if self._parameters.drifts:
-            self._starts[plants] = self._clock
+        self._starts[plants] = self._clock
         if ranges or self._parameters.drifts:
             self._update_dynamics()
 
@@ -531,14 +520,14 @@ class PlantBatch:
 
     def _update_dynamics(self) -> None:
         """Update coefficients and drift factors to the present sample of each plant."""
-        ages = self._clock - self._starts  # the present sample k of each plant's episode
-        ages_at_change = ages // DRIFT_INTERVAL * DRIFT_INTERVAL  # at the latest change
-        factors = self._dynamics.factors(self.numbers, ages_at_change)
+        k = self._clock - self._starts  # the present sample of each plant's episode
+        k_of_change = k // DRIFT_INTERVAL * DRIFT_INTERVAL  # the sample of the latest change
+        factors = self._dynamics.factors(self.numbers, k_of_change)
         if self._parameters.drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
         self._alpha = tuple(map(np.asarray, alpha))
-        samples_to_change = ages_at_change + DRIFT_INTERVAL - ages
+        samples_to_change = k_of_change + DRIFT_INTERVAL - k
         self._next_update = self._clock + int(samples_to_change.min())
 
 
@@ -584,6 +573,8 @@ class _InputResponse:
         shape () for one delay of all plants.
         """
         self._flows[:, plants] = 0.0
+        # What `add` returns until the present block of flows is full: flows of the new episode
+        # have no effect before that.
         self._response[:, plants] = 0.0
         if self._delays_differ:
             first_rows = self._longest - delays.astype(np.intp)

@@ -99,7 +99,7 @@ class Noise:
             getattr(streams[i], self._name).next_episode()
         if len(plants) == len(self._past_xi):
             self._next_row = len(self._block)  # `next` then generates a block for all plants
-        else:
+        else:  # the plants begin in the rest of the other plants' block
             self._fill(plants, self._next_row)
 
     def next(self) -> Values:
@@ -209,8 +209,8 @@ class _HeldSignal(ABC):
     def __init__(self, num_envs: int) -> None:
         self.present = np.zeros(num_envs)
         self._clock = 0  # the present time
-        self._due = np.zeros(num_envs, np.int64)  # the time of each plant's next change
-        self._earliest_due = 0
+        self._change_times = np.zeros(num_envs, np.int64)  # of the next change of each plant
+        self._next_change_time = 0  # the earliest of these times
 
     def next(self) -> Values:
         """Return the signal of all plants at the next sample, degC, shape (num_envs,).
@@ -218,18 +218,18 @@ class _HeldSignal(ABC):
         The caller must not modify the returned array.
         """
         self._clock += 1
-        if self._clock >= self._earliest_due:
-            self._make_due_changes()
+        if self._clock >= self._next_change_time:
+            self._make_changes()
         return self.present
 
-    def _make_due_changes(self) -> None:
-        """Change the signal of each plant whose next change is due at the present time."""
-        self._change(np.flatnonzero(self._due <= self._clock))
-        self._earliest_due = int(self._due.min())
+    def _make_changes(self) -> None:
+        """Change the signal of each plant whose next change is at the present time."""
+        self._change(np.flatnonzero(self._change_times <= self._clock))
+        self._next_change_time = int(self._change_times.min())
 
     @abstractmethod
     def _change(self, plants: Indices) -> None:
-        """Change the signal of the plants `plants`, and set when the signal changes next."""
+        """Change the signal of the plants `plants`, and move on the times of their changes."""
 
 
 class SetPoint(_HeldSignal):
@@ -260,15 +260,16 @@ class SetPoint(_HeldSignal):
                 streams[i].setpoint.next_episode()
         # The first level of the episode begins at the present sample.
         self._places[plants] = 0
-        self._due[plants] = self._clock
-        self._make_due_changes()
+        self._change_times[plants] = self._clock
+        self._make_changes()
         return self.present[plants]
 
     def ahead(self) -> list[float]:
         """Return the set points of a single plant at the next 600 samples, degC, in a list."""
         level = self.present.item()
         place = self._places.item()
-        known = self._earliest_due - self._clock - 1  # coming samples whose level is known
+        # The number of coming samples whose level is known: until the level's next change.
+        known = self._change_times.item() - self._clock - 1
         setpoints = [level] * min(known, SAMPLES_AT_A_TIME)
         while known < SAMPLES_AT_A_TIME:
             if self._levels.random:
@@ -281,7 +282,7 @@ class SetPoint(_HeldSignal):
             known += length
         self.present[0] = level
         self._places[0] = place
-        self._earliest_due = self._clock + 1 + known
+        self._change_times[0] = self._clock + 1 + known
         self._clock += SAMPLES_AT_A_TIME
         return setpoints
 
@@ -290,11 +291,11 @@ class SetPoint(_HeldSignal):
         if self._levels.random:
             for i in plants.tolist():
                 self.present[i], length = self._levels.sample(self._streams[i].setpoint)
-                self._due[i] += length
+                self._change_times[i] += length
         else:
             places = self._places[plants]
             self.present[plants] = self._level_values[places]
-            self._due[plants] += self._level_lengths[places]
+            self._change_times[plants] += self._level_lengths[places]
             self._places[plants] = (places + 1) % len(self._level_values)
 
 
@@ -344,19 +345,20 @@ class Disturbance(_HeldSignal):
         self._last_walks[plants] = 0.0
         self._next_columns[plants] = LOADS_AT_A_TIME  # no load has been generated yet
         self.present[plants] = 0.0
-        self._due[plants] = self._clock + LOAD_INTERVAL
-        self._earliest_due = int(self._due.min())
-        # Samples of the load of one plant that the next call of `ahead` returns first: 0 at the
-        # samples 1 to `LOAD_INTERVAL` - 1, until the first change.
-        self._surplus = [0.0] * (LOAD_INTERVAL - 1)
+        self._change_times[plants] = self._clock + LOAD_INTERVAL
+        self._next_change_time = int(self._change_times.min())
+        # Loads of a single plant at coming samples, which the next call of `ahead` returns
+        # first: 0 at the samples before the first change.
+        self._known_loads = [0.0] * (LOAD_INTERVAL - 1)
 
     def ahead(self) -> list[float]:
         """Return the load of a single plant at the next 600 samples, degC, in a list."""
         self._generate(ONLY_PLANT)
-        # The load is 0 until the first change, so a few samples are left for the next call.
-        samples = [*self._surplus, *np.repeat(self._loads[0], LOAD_INTERVAL).tolist()]
-        self._surplus = samples[SAMPLES_AT_A_TIME:]
-        return samples[:SAMPLES_AT_A_TIME]
+        # 600 further loads, of which the last 9 remain for the next call.
+        new_loads: list[float] = np.repeat(self._loads[0], LOAD_INTERVAL).tolist()
+        loads = self._known_loads + new_loads
+        self._known_loads = loads[SAMPLES_AT_A_TIME:]
+        return loads[:SAMPLES_AT_A_TIME]
 
     def _change(self, plants: Indices) -> None:
         """Set the load of the plants with the indices `plants` to the next value."""
@@ -365,7 +367,7 @@ class Disturbance(_HeldSignal):
         columns = self._next_columns[plants]
         self.present[plants] = self._loads[plants, columns]
         self._next_columns[plants] = columns + 1
-        self._due[plants] += LOAD_INTERVAL
+        self._change_times[plants] += LOAD_INTERVAL
 
     def _generate(self, plants: Indices) -> None:
         """Generate the next 60 values of the load of the plants with the indices `plants`."""
