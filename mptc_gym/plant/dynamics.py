@@ -176,7 +176,6 @@ class WantedFlow(WantedFlows):
 
     def __init__(self, parameters: Parameters) -> None:
         super().__init__(parameters, 1)
-        self._half_range = (self._u_max - self._u_min) / 2.0
         self._flow = 0.0  # v, t/h
 
     def change(self, actions: float) -> float:
