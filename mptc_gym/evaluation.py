@@ -309,16 +309,17 @@ def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
             f"bounds are kept for episodes of {SAMPLES:,} samples, not of {length:,}: leave "
             "max_episode_steps as it is",
         )
-    if len(least_by_seed[SEED]) == 1:  # one value for all seeds: only noise and load are random
-        return Bound(np.repeat(least_by_seed[SEED], len(seeds)))
-    seeds_with_bounds = []
     for first, least in least_by_seed.items():
+        if len(least) == 1:  # for all seeds, as only noise and load are random
+            return Bound(np.repeat(least, len(seeds)))
         if first <= seeds.start and seeds.stop <= first + len(least):
             return Bound(least[seeds.start - first : seeds.stop - first])
-        seeds_with_bounds.append(f"{first:,} to {first + len(least) - 1:,}")
+    known = [
+        f"{first:,} to {first + len(least) - 1:,}" for first, least in least_by_seed.items()
+    ]
     return Bound(
         None,
-        f"bounds of these plants are kept for seeds {' and '.join(seeds_with_bounds)}, not for "
+        f"bounds of these plants are kept for seeds {' and '.join(known)}, not for "
         f"{seeds.start:,} to {seeds.stop - 1:,}: choose seed and episodes among them",
     )
 
