@@ -107,8 +107,9 @@ class Panel:
     def fill(self, colour: Colour, first: float, last: float, low: float, high: float) -> None:
         """Fill the panel from sample `first` to `last`, and from the value `low` to `high`.
 
-        The area is at least one pixel wide and high, so that `fill` draws lines, too. `low` and
-        `high` have the unit of the vertical axis, degC or t/h. The colours of the picture are
+        The area is at least one pixel wide and high, so that `fill` draws lines, too; parts of
+        the area to the left of the panel are left out. `low` and `high` have the unit of the
+        vertical axis, degC or t/h. The colours of the picture are
         multiplied by `colour`, so that lines under the area remain visible.
         """
         left, top = self._point(first, high)
@@ -119,7 +120,7 @@ class Panel:
     def curve(
         self, colour: Colour, values: Sequence[float], width: int, *, is_staircase: bool
     ) -> None:
-        """Draw a curve of `values`, one for each of the latest samples, the newest last.
+        """Draw a curve of `values`, one for each sample in the record, the newest last.
 
         `values` have the unit of the vertical axis, degC or t/h. `width` is the line width in
         pixels. With `is_staircase`, each value holds until the next sample; otherwise, straight

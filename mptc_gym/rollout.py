@@ -336,7 +336,7 @@ def _compare_infos(infos: Infos, expected: Infos, k: int) -> None:
     # Compare the last names first: the last infos of a step are the noise, the load and the
     # drift factors, in which a difference explains differences in other infos.
     for name in reversed(names):
-        differences = np.abs(infos.get(name, np.nan) - expected[name])
+        differences = np.abs(infos.get(name, np.nan) - expected[name])  # NaN is refused
         if not (differences <= _TOLERANCE * (1.0 + np.abs(expected[name]))).all():
             raise ValueError(
                 f"env must run the episodes of its seeds, whose {name} at sample {k} is "

@@ -277,7 +277,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():
             seed_of_plant = seeds[i]
-            if seed_of_plant is None and i not in self._streams:
+            if seed_of_plant is None and i not in self._streams:  # at the first reset
                 seed_of_plant = np.random.SeedSequence().entropy
             if seed_of_plant is not None:
                 self._seeds[i] = int(seed_of_plant)
