@@ -1,13 +1,14 @@
 """Compare the speed of the environments with that of CartPole: `python -m benchmarks.speed`."""
 
-import importlib.util
 import time
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
+import numpy as np
+from numpy.typing import NDArray
 
-from benchmarks.lib.command import CommandError, Count, command, options
+from benchmarks.lib.command import Count, command, options
 from mptc_gym import PRESETS
 
 STEPS = 1201  # steps of a vector environment in a measurement: an episode, and a reset after it
@@ -39,20 +40,13 @@ class Options:
 
 def work(options: Options) -> None:
     """Measure speeds, and print a table for each number of plants."""
-    import pandas as pd
-
-    from benchmarks.lib.report import on_screen
-
     for n in ON_DEVICE if options.device else BATCHES:
-        try:
-            environments = make_environments(n, options.device)
-        except RuntimeError as error:
-            raise CommandError(f"--device: {error}") from error
-        rounds = [
-            {name: steps_a_second(env) for name, env in environments.items()}
+        environments = make_environments(n, options.device)
+        rates = [
+            [steps_a_second(env) for env in environments.values()]
             for _ in range(options.rounds)
         ]
-        print(f"\nn = {n:,}\n{on_screen(summary(pd.DataFrame(rounds)))}", flush=True)
+        print(f"\nn = {n:,}\n{table(list(environments), np.array(rates))}", flush=True)
     print(f"Medians of {options.rounds} rounds; in parentheses, 10th to 90th percentile.")
 
 
@@ -60,27 +54,26 @@ def make_environments(n: int, device: str | None) -> dict[str, Any]:
     """Return the environments to measure, each with n plants, by their names in the table.
 
     If `n` is 1, the environments are CartPole and the paper's plant. If `device` is None and n
-    is above 1, the environments are CartPole, the plants in NumPy and, if PyTorch is installed,
-    the plants in PyTorch on the CPU. If `device` is the name of a device, such as "cuda", and n
-    is above 1, the environments are the plants in PyTorch on this device.
+    is above 1, the environments are CartPole, and the plants in NumPy and in PyTorch on the
+    CPU. If `device` is the name of a device, such as "cuda", the environments are the plants in
+    PyTorch on this device.
     """
     if n == 1:
         return {name: gymnasium.make(name) for name in (REFERENCE, PLANT)}
+    import torch  # imported here, as it would slow `--help` down
+
+    from mptc_gym.torch_env import MiddlePointTorchEnv
+
+    torch.set_num_threads(1)  # one core, as for the NumPy environments
     environments: dict[str, Any] = {}
     if device is None:
         mode = "vector_entry_point"
         environments[REFERENCE] = gymnasium.make_vec(REFERENCE, n, vectorization_mode=mode)
         for name, arguments in PLANTS.items():
             environments[PLANT + name] = gymnasium.make_vec(PLANT, n, **arguments)
-    if device or importlib.util.find_spec("torch"):
-        import torch
-
-        from mptc_gym.torch_env import MiddlePointTorchEnv
-
-        torch.set_num_threads(1)  # one core, as for the NumPy environments
-        for name, arguments in PLANTS.items():
-            plants = MiddlePointTorchEnv(n, device=device or "cpu", **arguments)
-            environments[f"in PyTorch{name}"] = plants
+    for name, arguments in PLANTS.items():
+        plants = MiddlePointTorchEnv(n, device=device or "cpu", **arguments)
+        environments[f"in PyTorch{name}"] = plants
     return environments
 
 
@@ -110,23 +103,20 @@ def steps_a_second(env: Any) -> float:
     return float(steps * getattr(env, "num_envs", 1) / (time.perf_counter() - start))
 
 
-def summary(rates: Any) -> Any:
-    """Return a table of texts of the steps a second of each environment.
+def table(names: list[str], rates: NDArray[np.float64]) -> str:
+    """Return a table of the steps a second of environments, as text.
 
-    `rates` is a DataFrame with a row for each round, and the steps a second of each environment
-    in a column. The ratio to the speed of the first environment is computed in each round. The
-    table has the median over the rounds, with the 10th and the 90th percentile in parentheses.
+    `rates` has the steps a second in each round, shape (rounds, environments). The ratio to the
+    speed of the first environment is computed in each round. The table has the median over the
+    rounds, with the 10th and the 90th percentile in parentheses.
     """
-    import pandas as pd  # imported here, as pandas would slow `--help` down
-
-    reference = rates.columns[0]
-    ratios = rates.div(rates[reference], axis="index").quantile([0.1, 0.5, 0.9])
-    low, median, high = (ratios.loc[share].map("{:.2f}".format) for share in (0.1, 0.5, 0.9))
-    columns = {
-        "steps a second": rates.median().map("{:,.0f}".format),
-        f"ratio to {reference}": median + " (" + low + " to " + high + ")",
-    }
-    return pd.DataFrame(columns).reset_index(names="case")
+    ratios = rates / rates[:, :1]
+    lines = [f"{'case':<22}{'steps a second':>16}  ratio to {names[0]}"]
+    for i, name in enumerate(names):
+        low, median, high = np.quantile(ratios[:, i], [0.1, 0.5, 0.9])
+        speed = f"{name:<22}{np.median(rates[:, i]):>16,.0f}"
+        lines.append(f"{speed}  {median:.2f} ({low:.2f} to {high:.2f})")
+    return "\n".join(lines)
 
 
 main = command("speed", Options, work)
