@@ -110,7 +110,7 @@ class TestEstimates:
         least = bound.least
         rows = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
         rows = rows.assign(scenario="constant")
-        found = estimate(rows, [bound], ROSTER)
+        found = estimate(rows, [bound])
         nn, ppo_ = found.to_dict("records")
         assert (nn["mean"].value, nn["limit"]) == (2.0, least.value)
         assert nn["ratio"].value == pytest.approx(2.0 / least.value)
@@ -127,7 +127,7 @@ class TestEstimates:
             half = (least.value + least.idle.value) / 2
             errors = some_runs(pi=[[least.idle.value, half]], nn=[[least.value, half]])
             rows.append(errors.assign(scenario=scenario.name))
-        scores = ranked(estimate(pd.concat(rows), bounds, ROSTER))
+        scores = ranked(estimate(pd.concat(rows), bounds))
         assert [*scores] == ["nn", "pi"]
         assert scores["nn"].value == pytest.approx(0.75)
         assert scores["pi"].value == pytest.approx(0.25)

@@ -1,8 +1,7 @@
 """Estimate errors, error ratios and scores of controllers from their runs."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +10,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.compare.runs import Bound
-from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles
-from benchmarks.loop.measures import is_random
 
 BOOTSTRAP_SEED = 0  # seed of the resampling for confidence intervals, not of an episode
 
 
-def estimate(
-    runs: pd.DataFrame, bounds: Sequence[Bound], controllers: Mapping[str, ControllerSpec]
-) -> pd.DataFrame:
+def estimate(runs: pd.DataFrame, bounds: Sequence[Bound]) -> pd.DataFrame:
     """Estimate the mean errors and the scores of controllers, with 95 % confidence intervals.
+
+    The confidence intervals of a single run have no width.
 
     Parameters
     ----------
@@ -32,8 +29,6 @@ def estimate(
         with which all other controllers are compared.
     bounds : sequence of Bound
         Least possible errors. A scenario that has none is left out of the result.
-    controllers : mapping
-        Record of each controller by name.
 
     Returns
     -------
@@ -42,8 +37,7 @@ def estimate(
         `scenario` and `agent`:
 
         - `limit`: the least possible error, degC;
-        - `mean`: the mean error over the runs, degC, an `Estimate`. If runs use random numbers
-          and the table has only one run, the ends of the confidence interval are infinite;
+        - `mean`: the mean error over the runs, degC, an `Estimate`;
         - `ratio`: the error ratio, which is `mean` divided by `limit`, an `Estimate`;
         - `scores`: an array with the score of each run, shape (members, runs);
         - `difference`: the mean over the runs of the controller's error minus the error of the
@@ -57,11 +51,8 @@ def estimate(
     for scenario, least in bounds:
         name = scenario.name
         errors_of = errors_by_agent(runs[runs["scenario"] == name])
-        is_noisy = is_random(scenario.parameters)
         for agent, errors in errors_of.items():
             mean = bootstrap(errors, seed=BOOTSTRAP_SEED)
-            if errors.size == 1 and (controllers[agent].random or is_noisy):
-                mean = replace(mean, low=-math.inf, high=math.inf)
             row = {
                 "scenario": name,
                 "agent": agent,
@@ -128,17 +119,15 @@ def write_numbers(path: Path, table: pd.DataFrame) -> None:
     """Write a table of numbers, texts and objects of class `Estimate` to the CSV file `path`.
 
     A column NAME of estimates becomes three columns: NAME has the values, and NAME_low and
-    NAME_high have the ends of the confidence intervals. An infinite end of an interval becomes
-    an empty cell. The infinite settling time of a run that does not settle becomes "not
-    settled".
+    NAME_high have the ends of the confidence intervals. The infinite settling time of a run
+    that does not settle becomes "not settled".
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():
         if any(isinstance(cell, Estimate) for cell in cells):
             for field, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
                 # A cell without an estimate is NaN, which does not have the attribute.
-                numbers = pd.Series([getattr(cell, field, math.nan) for cell in cells])
-                columns[f"{name}{suffix}"] = numbers.replace([math.inf, -math.inf], math.nan)
+                columns[f"{name}{suffix}"] = [getattr(cell, field, math.nan) for cell in cells]
         else:
             columns[name] = cells.replace(math.inf, "not settled")
     pd.DataFrame(columns).to_csv(path, index=False)

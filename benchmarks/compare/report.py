@@ -116,7 +116,7 @@ def write(
     runs = runs[runs["scenario"].isin([bound.scenario.name for bound in bounds])]
     if runs.empty:
         return note
-    estimates = estimate(runs, bounds, controllers)
+    estimates = estimate(runs, bounds)
     write_numbers(folder / "estimates.csv", estimates.drop(columns="scores"))
     scores = ranked(estimates)
     comparison = Comparison(controllers, bounds, results, runs, estimates, scores)
