@@ -99,12 +99,8 @@ class TestCommand:
         assert set(numbers["claim"]) == {"direction"}
         assert numbers["value"].iloc[1] == 100.0  # all of them diverge in the end ...
         assert numbers["shown"].iloc[1] == "undecided"  # ... but four prove little
-        printed = capsys.readouterr()
-        assert "1 of 2 tasks are missing\nnoise: ArithmeticError: no weights" in printed.err
-        page = (out / "report.md").read_text()
-        assert "Unfinished: 1 of 2 tasks are missing." in page
-        for text in (printed.out, page):
-            assert "Training with -D(G) diverges at once" in text
+        assert "Unfinished: 1 of 2 tasks are missing." in (out / "report.md").read_text()
+        assert "Training with -D(G) diverges at once" in capsys.readouterr().out
 
     def test_short_runs_of_all_claims_give_the_numbers_that_they_gave(self, monkeypatch):
         class Short(Batch):
