@@ -93,9 +93,11 @@ from benchmarks.lib.fan_out import FanOut
 node = {"num_cpus": 2, "object_store_memory": 80_000_000, "include_dashboard": False}
 cluster = Cluster(initialize_head=True, head_node_args=node)
 os.environ["RAY_ADDRESS"] = cluster.address
-work = {f"plant {seed}": partial(pow, 0.1, seed) for seed in range(3)} | {"where": os.getpid}
+work = {f"plant {seed}": partial(pow, 0.1, seed) for seed in range(3)}
+work |= {"folder": os.getcwd, "files": os.listdir}
 there = FanOut(backend="ray").run(work, "on the cluster").results
-assert there.pop("where") != os.getpid()
+assert there.pop("folder") != os.getcwd()
+assert {"agents", "benchmarks", "mptc_gym"} < {*there.pop("files")}
 assert there == {f"plant {seed}": 0.1**seed for seed in range(3)}
 print("the same numbers")
 cluster.shutdown()

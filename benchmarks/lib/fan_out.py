@@ -147,13 +147,11 @@ def with_progress_bar(items: Iterable[Item], title: str, total: int) -> Iterable
 
 
 def _connect_to_ray() -> None:
-    """Send the code to the Ray cluster that runs at RAY_ADDRESS, or else on this machine."""
+    """Send the checkout to the Ray cluster at RAY_ADDRESS, or else on this machine."""
     import ray  # imported here, as it is optional and slow to import
     from ray.util.joblib import register_ray
 
     register_ray()
-    # "/*" excludes everything. A pattern with "!", as in .gitignore, brings back the code and
-    # the user's own modules.
-    excluded = ["/*", "!/agents", "!/benchmarks", "!/mptc_gym", "!/*.py"]
-    code = {"working_dir": str(ROOT), "excludes": excluded}
+    # Ray also leaves out what .gitignore names, such as .venv and results.
+    code = {"working_dir": str(ROOT), "excludes": ["/.git"]}
     ray.init("auto", runtime_env=code, log_to_driver=False)
