@@ -82,6 +82,26 @@ class TestPPO:
         assert (rewards == rewards[:, :1]).all()
         assert len(set(rewards[:, 0])) == 3
 
+    def test_plants_of_both_kinds_are_stepped_as_in_batches_of_their_own(self):
+        ending = [ppo.TrainingPlants(n, {"max_episode_steps": 2}) for n in (8, 16)]
+        plants, alone = (ppo.Plants(replace(RECIPE, plants=ending)) for _ in range(2))
+        actions = np.linspace(-1.0, 1.0, 24)[:, np.newaxis]
+        plants.reset()
+        plants.step(actions)
+        inputs, rewards, _, infos = plants.step(actions)
+        for batch, rows in zip(alone.batches, (slice(8), slice(8, 24)), strict=True):
+            batch.reset()
+            batch.step(actions[rows])
+            observations, rewards_alone, _, infos_alone = batch.step(actions[rows])
+            last, last_alone = (
+                np.array([info["terminal_observation"] for info in both])
+                for both in (infos[rows], infos_alone)
+            )
+            assert np.array_equal(rewards[rows], rewards_alone)
+            matrix = ppo.features(RECIPE).T
+            np.testing.assert_allclose(inputs[rows], observations @ matrix, atol=1e-5)
+            np.testing.assert_allclose(last, last_alone @ matrix, atol=1e-5)
+
     def test_what_a_group_has_in_common_is_no_advantage(self):
         model = ppo.begin(RECIPE, 0)
         spaces = model.observation_space, model.action_space
