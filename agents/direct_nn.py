@@ -137,7 +137,7 @@ class DirectNNController(Controller):
         if self.num_envs is not None:
             self._check(from_1, "num_envs")
         self.n_obs = max(self.n_inputs, self.error_index + 1)
-        # Shapes of one network's weights.
+        # Shapes of one network's weights, in the order of the fields of `Weights`.
         self._shapes = {
             "W": (self.n_hidden, self.n_inputs),
             "theta_1": (self.n_hidden,),
@@ -147,7 +147,11 @@ class DirectNNController(Controller):
         self.weights = self._initial_weights()
 
     def _initial_weights(self) -> Weights:
-        """Return random initial weights, with the seed `seed + i` for network i of a batch."""
+        """Return random initial weights, with the seed `seed + i` for network i of a batch.
+
+        Each network has a random generator of its own, which draws the arrays in the order of
+        `_shapes`, so network i equals the single network with the seed `seed + i`.
+        """
         members = self.num_envs or 1
         generators = [np.random.default_rng(self.seed + i) for i in range(members)]
         arrays: dict[str, Array] = {}

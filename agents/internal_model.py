@@ -28,13 +28,15 @@ class InternalModelController(ModelBasedController):
         self._pole = math.exp(-self.sampling_interval / self.time_constant)
         # Effect of a flow on the model's next output, degC per t/h.
         self._input_gain = self.gain * (1.0 - self._pole)
-        self._delay = max(round(self.delay / self.sampling_interval), 1)  # samples
+        # d + 1 samples, for the transport delay d of equation (28) of the paper.
+        self._delay = max(round(self.delay / self.sampling_interval), 1)
 
     def reset(self) -> None:
         """Set the model's output to 0 before a new episode, as for a plant at rest."""
         super().reset()
-        # Outputs of the undelayed model at the latest samples, degC, at most `_delay` outputs.
-        # The newest output is last.
+        # Outputs x of the undelayed model at the latest samples, degC, at most `_delay` = d + 1
+        # outputs from x(k-d) to x(k). In the first d samples, the oldest output is x(0) = 0,
+        # which equals x(k-d) of a model that was at rest.
         self._outputs: list[Values] = [np.float64(0.0)]
 
     @property

@@ -195,15 +195,7 @@ class PolicyNetwork(Controller):
             )
 
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the commands u(k) or the changes of the wanted flows, t/h, shape (loops,).
-
-        A ValueError is raised unless the observations `rows` have the shape (loops, n_obs).
-        """
-        if rows.shape[1] != self.n_obs:
-            raise ValueError(
-                f"observation must have {self.n_obs} elements, got {rows.shape[1]}: "
-                f"make the environment with the arguments {self.interface}"
-            )
+        """Return the commands u(k) or the changes of the wanted flows, t/h, shape (loops,)."""
         x = rows.astype(np.float32)
         *hidden_layers, (last_W, last_b) = self.layers
         for W, b in hidden_layers:
@@ -218,6 +210,7 @@ class PolicyNetwork(Controller):
     def _action(self, command: Values) -> NDArray[np.float32]:
         """Return the actions that give `command`, in the shape of `command`."""
         if self.action == "change":
+            # The inverse of the last lines of `_control`: the action is the network's output.
             half_range = (self.u_max - self.u_min) / 2.0
             return np.asarray(command / (self.max_move * half_range), np.float32)
         return super()._action(command)

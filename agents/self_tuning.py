@@ -183,6 +183,7 @@ class SelfTuningController(ModelBasedController):
         edge = 0.0
         if self.dead_zone > 0.0:
             edge = self.dead_zone / abs(self._unit_flow) + CLEARANCE
+        # On a plant with a negative gain, the unit of flow is negative, so the limits swap.
         low, high = sorted([self.u_min / self._unit_flow, self.u_max / self._unit_flow])
         self._bank = self._new_bank(n)
         self._law = Law(self._bank, n, edge, (low, high), self._setpoint_distribution())
@@ -199,6 +200,7 @@ class SelfTuningController(ModelBasedController):
             setpoint = rows[:, self.setpoint_index] / self._unit_temperature
             output = setpoint - rows[:, self.error_index] / self._unit_temperature
             flow = self._law.flow(setpoint.astype(np.float32), output.astype(np.float32))
+            # The commands, t/h, of this sample and of those until the next computation.
             self._held = self._unit_flow * flow.astype(np.float64)
         self._k += 1
         command: NDArray[np.float64] = self._held
