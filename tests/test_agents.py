@@ -1,11 +1,9 @@
 """Test the controllers: their equations, batches of loops, files and errors."""
 
-import itertools
 import json
 import pickle
 from functools import partial
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
@@ -29,7 +27,7 @@ from tests.conftest import STEP_TEST, assert_the_seed_is_all_that_differs
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
 TUNED = {**STEP_TEST, "closed_loop_time_constant": 80.0}
 MAKERS = {  # of every controller that reads set points and errors alone
-    "nn": partial(DirectNNController),
+    "nn": partial(DirectNNController, num_envs=1),
     "pi": partial(PIController),
     "smith": partial(SmithPredictor, **TUNED),
     "dahlin": partial(DahlinController, **TUNED),
@@ -40,17 +38,6 @@ INTERNAL_MODELS = (
     partial(SmithPredictor, **TUNED),
     partial(DahlinController, **{**TUNED, "closed_loop_time_constant": 16.0}),
 )
-WINDOWS = {"setpoint_window": 1, "output_window": 2, "action_window": 2}
-
-
-@pytest.fixture(params=MAKERS)
-def make(request):
-    return MAKERS[request.param]
-
-
-def of_loops(make, n):
-    """Return a controller of n loops; `make` is a value of `MAKERS`."""
-    return make(num_envs=n) if make.func is DirectNNController else make()
 
 
 def are_equal(first, second):
@@ -58,25 +45,10 @@ def are_equal(first, second):
     return data_equivalence(vars(first), vars(second), exact=True)
 
 
-def layers(*sizes):
-    """Return random layers of a network with these numbers of inputs, nodes and outputs."""
-    generator = np.random.default_rng(0)
-    return [
-        (generator.normal(size=(after, before)), generator.normal(size=after))
-        for before, after in itertools.pairwise(sizes)
-    ]
-
-
 def policy(**arguments):
-    """Return a policy with random layers, five inputs and these other arguments."""
-    defaults = {"layers": layers(5, 7, 6, 1), "observation": WINDOWS}
+    """Return a policy whose output is the error e, with these other arguments."""
+    defaults = {"layers": [([[1.0]], [0.0])], "observation": {"error_window": 1}}
     return PolicyNetwork(**defaults | arguments)
-
-
-def one_weight_policy(weight, bias, **arguments):
-    """Return a policy whose output is `weight` e + `bias`, for the error e."""
-    layer = np.array([[weight]]), np.array([bias])
-    return PolicyNetwork([layer], observation={"error_window": 1}, **arguments)
 
 
 @pytest.mark.parametrize(
@@ -105,9 +77,10 @@ def test_pi_by_hand(arguments, errors, commands):
         action = controller.act([0, 0, 0, e, 9, 9])
         assert controller.command == pytest.approx(u)
         assert action == pytest.approx([2.0 * (u - low) / (high - low) - 1.0])
+        assert action.dtype == np.float32
 
 
-BAD_OBSERVATIONS = [np.zeros(3), np.zeros((2, 2, 6)), np.zeros((2, 6)), np.full(6, np.nan)]
+BAD_OBSERVATIONS = [np.zeros((1, 3)), np.zeros((1, 1, 6)), np.zeros((2, 6)), [[np.nan] * 6]]
 REFUSED = [  # arguments of an environment, and the message of the error
     ({"u_max": 12.0}, r"u_max=12\.0, got -10\.0, 10\.0"),
     ({"setpoint_window": 2}, "newest error as element 3"),
@@ -116,46 +89,19 @@ REFUSED = [  # arguments of an environment, and the message of the error
 ]
 
 
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 class TestEveryController:
-    def test_action_is_one_of_the_environment(self, make):
-        controller = make()
-        env = gymnasium.make("MiddlePoint-v0")
-        action = controller.act(env.reset(seed=0)[0])
-        assert action.shape == (1,)
-        assert action.dtype == np.float32
-        _, _, _, _, info = env.step(action)
-        assert info["command"] == pytest.approx(controller.command, rel=1e-6)
-
     def test_bad_observation_changes_nothing(self, make):
         controller, twin = make(), make()
-        controller.act(np.ones(6)), twin.act(np.ones(6))
+        controller.act(np.ones((1, 6))), twin.act(np.ones((1, 6)))
         for bad in BAD_OBSERVATIONS:
             with pytest.raises(ValueError, match=r"^observation must"):
                 controller.act(bad)
-            assert np.array_equal(controller.act(np.ones(6)), twin.act(np.ones(6)))
-
-    def test_a_loop_in_a_batch_gets_the_actions_of_a_single_loop(self, make, rng):
-        batch = of_loops(make, 3)
-        singles = [make(seed=i) if "seed" in vars(batch) else make() for i in range(3)]
-        # Bit for bit, apart from the order of float32 sums in banks and networks.
-        tolerance = 1e-4 if isinstance(batch, SelfTuningController) else 0.0
-        for _ in range(60):
-            rows = rng.normal(0.0, 3.0, (3, 6))
-            alone = [single.act(row) for single, row in zip(singles, rows, strict=True)]
-            longer_rows = np.column_stack([rows, rng.normal(size=(3, 2))])
-            actions = batch.act(longer_rows)
-            np.testing.assert_allclose(actions, alone, rtol=0.0, atol=tolerance)
-
-    def test_the_number_of_loops_is_fixed_until_reset(self, make):
-        controller = of_loops(make, 3)
-        controller.act(np.zeros((3, 6)))
-        with pytest.raises(ValueError, match="observation must"):
-            controller.act(np.zeros((2, 6)))
-        controller.reset()
-        assert np.all(controller.command == 0.0)
+            actions = controller.act(np.ones((1, 6))), twin.act(np.ones((1, 6)))
+            assert np.array_equal(*actions)
 
     def test_plants_that_it_was_not_made_for_are_refused(self, make):
-        controller = of_loops(make, 1)
+        controller = make()
         random_plant = Parameters(dead_zone=[4.0, 5.0], output_window=2)
         controller.check_environment(random_plant, 1)
         for arguments, message in REFUSED:
@@ -223,19 +169,25 @@ class TestDirectNN:
             lambda seed: DirectNNController(seed=seed).weights.W
         )
 
-    def test_weights_can_be_assigned_to_a_whole_batch(self):
+    def test_a_network_in_a_batch_is_that_of_its_seed_to_the_bit(self, rng):
+        batch = DirectNNController(num_envs=3, seed=4)
+        singles = [DirectNNController(seed=4 + i) for i in range(3)]
+        for _ in range(60):
+            rows = rng.normal(0.0, 3.0, (3, 6))
+            alone = [single.act(row) for single, row in zip(singles, rows, strict=True)]
+            # Further elements of an observation have no effect.
+            assert np.array_equal(batch.act(np.column_stack([rows, rows])), alone)
+
+    def test_weights_are_assigned_to_each_network_of_a_batch_or_refused(self):
         weights = DirectNNController(seed=3).weights
         batch = DirectNNController(num_envs=2)
         batch.weights = weights
-        assert np.array_equal(batch.weights.W, [weights.W, weights.W])
-
-    def test_bad_weights_change_nothing(self):
-        nn = DirectNNController()
-        before = nn.weights
-        for field, shape in (("W", (6, 3)), ("W_1", 4), ("theta_2", 2)):
+        before = batch.weights
+        assert np.array_equal(before.W, [weights.W, weights.W])
+        for field, shape in (("W", (6, 3)), ("W_1", 4), ("theta_2", 3)):
             with pytest.raises(ValueError, match="requested shape"):
-                nn.weights = Weights(**vars(before) | {field: np.zeros(shape)})
-            assert are_equal(nn.weights, before)
+                batch.weights = Weights(**vars(weights) | {field: np.zeros(shape)})
+            assert are_equal(batch.weights, before)
 
     def test_weights_change_at_every_third_sample_while_learning_is_on(self):
         nn = DirectNNController(update_interval=3)
@@ -293,18 +245,17 @@ def test_with_the_right_model_the_delay_only_shifts_the_output(setpoint, actuato
 def test_the_response_with_dahlins_controller_is_a_first_order_lag_after_the_delay():
     pole, samples = np.exp(-8 / 161), np.arange(100)
     plant = {"a": (1.0, -pole), "b": (-0.6825 * (1 - pole),), "c": (1.0,), "dead_zone": 0.0}
+    commands = []  # for an error of 0.5 degC at rest
     for filter_time_constant in (0.0, 100.0):
         controller = DahlinController(**TUNED, filter_time_constant=filter_time_constant)
         found = rollout(make_plants(1, 119, **plant, setpoint=2.0), controller, 119, seed=0)
         # lambda = 80 s is ten samples; the delay is 19.
         lag = 2.0 * (1.0 - np.exp(-samples / 10.0))
         np.testing.assert_allclose(found.output[18:118, 0], lag, atol=1e-4)
-    # The filter acts on loads alone, of which it takes 1 - exp(-8 / 100) in the first sample.
-    commands = []
-    for filter_time_constant in (0.0, 100.0):
-        controller = DahlinController(**TUNED, filter_time_constant=filter_time_constant)
+        controller.reset()
         controller.act([0.0, 0.0, 0.0, 0.5])
         commands.append(controller.command)
+    # The filter acts on loads alone, of which it takes 1 - exp(-8 / 100) in the first sample.
     assert commands[1] / commands[0] == pytest.approx(1.0 - np.exp(-0.08))
 
 
@@ -325,29 +276,27 @@ def test_no_controller_winds_up_at_a_limit_or_stays_in_the_dead_zone(make):
 class TestPolicyNetwork:
     def test_equals_torch(self):
         torch = pytest.importorskip("torch")
-        network = policy(layers=[(W / 3.0, b / 3.0) for W, b in layers(5, 7, 6, 1)])
-        x = np.random.default_rng(1).uniform(-2, 2, size=(50, 5))
-        h = torch.tensor(np.float32(x))
-        for i, (W, b) in enumerate(network.layers):
-            h = torch.nn.functional.linear(h, torch.tensor(W), torch.tensor(b))
-            h = h.tanh() if i < len(network.layers) - 1 else h
-        expected = h.clamp(-1.0, 1.0).numpy()
-        assert np.abs(expected).min() < 0.9  # not all at the limits
+        linear = [torch.nn.Linear(*sizes) for sizes in ((5, 7), (7, 6), (6, 1))]
+        tanh = torch.nn.Tanh()
+        expected = torch.nn.Sequential(linear[0], tanh, linear[1], tanh, linear[2])
+        x = torch.randn(50, 5, generator=torch.manual_seed(1)) * 5.0
+        layers = [
+            (layer.weight.numpy(force=True), layer.bias.numpy(force=True)) for layer in linear
+        ]
+        network = policy(layers=layers, observation={"error_window": 5})
         # PyTorch adds in another order; 1e-5 is some hundred roundings of float32.
-        assert network.act(x) == pytest.approx(expected, abs=1e-5)
+        actions = expected(x).clamp(-1.0, 1.0).numpy(force=True)
+        assert network.act(x) == pytest.approx(actions, abs=1e-5)
 
-    def test_commands_fit_other_limits(self):
-        network = one_weight_policy(0.0, 0.5, u_min=-4.0, u_max=8.0)
-        network.act([[0.0]])
-        assert network.command == pytest.approx(5.0)  # three quarters of the way up
-
-    def test_an_action_is_a_change_of_the_flow_where_the_network_was_trained_so(self, rng):
+    def test_an_action_sets_or_changes_the_flow_as_in_the_training(self, rng):
         limits = {"u_min": -4.0, "u_max": 8.0}
-        network = one_weight_policy(1.0, 0.0, action="change", max_move=0.3, **limits)
         errors = rng.normal(size=(100, 1)).astype(np.float32)
-        np.testing.assert_array_equal(network.act(errors), errors.clip(-1.0, 1.0))
-        assert network.act([0.5]) == 0.5  # without memory, the batch size may change
-        assert network.command == pytest.approx(0.5 * 0.3 * 6.0)
+        for form, command in (("flow", 5.0), ("change", 0.5 * 0.3 * 6.0)):
+            network = policy(action=form, max_move=0.3, **limits)
+            actions = network.act(errors)
+            np.testing.assert_allclose(actions, errors.clip(-1.0, 1.0), atol=1e-7)
+            network.act([0.5])  # without memory, the batch size may change
+            assert network.command == pytest.approx(command)
 
 
 class Harm:
@@ -402,7 +351,7 @@ BAD = {
     ],
     policy: [
         ("action", "jump"), ("max_move", 0.0), ("compensated_dead_zone", np.nan),
-        ("layers", []), ("layers", layers(4, 3, 1)), ("layers", layers(5, 3, 2)),
+        ("layers", [(np.ones((1, 5)), [0.0])]), ("layers", [(np.ones((2, 1)), np.ones(2))]),
     ],
 }  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from agents import SelfTuningController, output_filter
 from agents.bank import (
@@ -39,7 +40,7 @@ def test_it_identifies_the_plant(delay, gain, time_constant, noise):
     )  # fmt: skip
     rollout(plants, controller, 1200, 5_900_000)
     estimates = controller.estimates
-    assert estimates["delay"] == pytest.approx(np.full(2, 8.0 * (delay + 1)), abs=16.0)
+    assert estimates["delay"] == pytest.approx(np.full(2, 8.0 * (delay + 1)), abs=1.0)
     assert estimates["gain"] == pytest.approx(np.full(2, GAIN * gain), rel=0.1)
     constant = np.full(2, TIME_CONSTANT * time_constant)
     assert estimates["time_constant"] == pytest.approx(constant, rel=0.25)
@@ -66,36 +67,22 @@ class TestOutputFilter:
         responses = np.concatenate([[0.0], np.cumsum(rng.normal(size=samples)) / 5.0])
         outputs = 1.1 * responses + 0.2 * rng.normal(size=samples + 1)
         a1, a2 = self.POLE + FAST_POLE, -self.POLE * FAST_POLE
-        # Responses of v(k), k = 1 to the last, to unit xi(j) and eta(j).
-        of_noise, of_load = np.zeros((2, samples, samples))
-        for j in range(samples):
-            noise, load, w = np.zeros(samples + 2), np.zeros(samples + 2), 0.0
-            for k in range(samples):
-                xi = float(k == j) + NOISE_COLOUR[0] * float(k == j + 1)
-                w = LOAD_MEMORY * w + float(k == j)
-                noise[k] = a1 * noise[k - 1] + a2 * noise[k - 2] + xi
-                load[k] = a1 * load[k - 1] + a2 * load[k - 2] + (1.0 - a1 - a2) * w
-            of_noise[:, j], of_load[:, j] = noise[:samples], load[:samples]
+        # Responses of v(k), k = 1 to the last, to unit xi(j) and eta(j), in column j.
+        units, of_v = np.eye(samples), [1.0, -a1, -a2]
+        of_noise = signal.lfilter([1.0, NOISE_COLOUR[0]], of_v, units, axis=0)
+        w = signal.lfilter([1.0], [1.0, -LOAD_MEMORY], units, axis=0)
+        of_load = signal.lfilter([1.0 - a1 - a2], of_v, w, axis=0)
         s = responses[1:]
         walks = np.minimum.outer(np.arange(1, samples + 1), np.arange(1, samples + 1))
         gains = GAIN_SPREAD**2 + drift**2 * walks
-        weights = LOAD_MEMORY ** np.arange(samples - 1, -1, -1)  # of eta in the last w
         covariance = (1.0 - READING_SHARE) * self.VARIANCE * of_noise @ of_noise.T
         covariance += change**2 * of_load @ of_load.T + s[:, None] * gains * s
         covariance += READING_SHARE * self.VARIANCE * np.eye(samples)
         surprise = np.linalg.solve(covariance, outputs[1:] - s)
         kalman = self.filtered(responses, outputs)
         assert kalman.gain[0] == pytest.approx(1.0 + gains[-1] * s @ surprise, abs=1e-9)
-        load = change**2 * (of_load @ weights) @ surprise
+        load = change**2 * (of_load @ w[-1]) @ surprise
         assert kalman.load[0] == pytest.approx(load, abs=1e-9)
-
-    def test_the_most_likely_filter_distinguishes_a_steady_load_from_noise(self, rng):
-        noise = 0.2 * rng.normal(size=600)
-        calm = self.filtered(np.zeros(600), noise)
-        loaded = self.filtered(np.zeros(600), noise + 2.0 * (np.arange(600) > 300))
-        # The first filter expects the smallest changes of the load.
-        assert calm.weights[0, 0] > 0.4 > loaded.weights[0, 0]
-        assert loaded.load[0] == pytest.approx(2.0, abs=0.3)
 
     def test_a_load_remains_in_the_forecast_and_noise_does_not(self):
         pole, fading = np.array([self.POLE]), np.array([self.POLE**19])
@@ -138,18 +125,10 @@ class TestRandomSetpoint:
 @pytest.mark.parametrize("dead_zone", [5.0, 7.0])
 def test_every_command_is_0_or_passes_the_dead_zone(observations, dead_zone):
     controller = SelfTuningController(**STEP_TEST, dead_zone=dead_zone)
-    for rows in observations:
+    for rows in np.concatenate([scale * observations for scale in (1.0, 1e3, 1e6, 1.0)]):
         controller.act(rows)
         size = np.abs(controller.command)
-        assert ((size == 0.0) | (size >= dead_zone)).all()
-
-
-def test_huge_observations_lead_to_finite_commands_and_estimates(rng):
-    controller = SelfTuningController(**KNOWN)
-    for scale in (1.0, 1e3, 1e6, 1.0):
-        for _ in range(60):
-            controller.act(rng.normal(size=(3, 6)) * scale)
-            assert np.isfinite(controller.command).all()
+        assert ((size == 0.0) | (size >= dead_zone) & (size <= 10.0)).all()
     multiples = controller.estimates["gain"] / GAIN
     assert multiples == pytest.approx(multiples.clip(0.3, 3.0))
 
