@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.plant.checks import NOT_A_NUMBER, is_count, one_of, reject
+from mptc_gym.plant.checks import NOT_A_NUMBER, count, one_of, reject
 from mptc_gym.plant.dynamics import (
     DRIFT_INTERVAL,
     FACTORS,
@@ -157,6 +157,7 @@ class _RandomSetPoint(_Signal):
         self._end = self._next_end = self._zeros.to(torch.int64)
 
     def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
+        # Samples of the block that has ended may have been on the next level of other plants.
         self._begin_next_levels(k)
         levels, lengths = self._draw()
         self._level = torch.where(mask, levels, self._level)
@@ -177,7 +178,7 @@ class _RandomSetPoint(_Signal):
         return levels, self._uniform(distribution.shortest, distribution.longest)
 
     def _begin_next_levels(self, k: SampleNumber) -> None:
-        """Make the next level the present level of each plant whose level has ended at k."""
+        """Make the next level the present level of each plant whose level has ended by k."""
         has_ended = self._end <= k
         self._level = torch.where(has_ended, self._next_level, self._level)
         self._end = torch.where(has_ended, self._next_end, self._end)
@@ -229,13 +230,12 @@ class _WantedFlows(WantedFlows):
     def _rounded_actions(self, commands: Any) -> Any:
         """Return the actions that `float32_action` returns in NumPy, with gradients."""
         actions = action_from_command(commands, self._u_min, self._u_max).to(torch.float32)
-        rounded_actions = actions.detach().to(commands.dtype)
-        rounded_commands = (rounded_actions + 1.0) * self._half_range + self._u_min
-        had_effect = commands.abs() >= self._dead_zone
-        has_effect = rounded_commands.abs() >= self._dead_zone
-        size = rounded_actions.to(torch.float32).abs().clamp(min=1.0)
-        spacing = torch.nextafter(size, 2.0 * size) - size
-        moves = (had_effect & ~has_effect) * spacing.copysign(commands.detach())
+        rounded_commands = (actions.to(commands.dtype) + 1.0) * self._half_range + self._u_min
+        has_lost_effect = rounded_commands.abs() < self._dead_zone
+        has_lost_effect &= commands.abs() >= self._dead_zone
+        size = actions.detach().abs().clamp(min=1.0)
+        spacing = torch.nextafter(size, 2.0 * size) - size  # of float32 numbers
+        moves = has_lost_effect * spacing.copysign(commands.detach())
         return (actions + moves).to(commands.dtype)
 
 
@@ -719,10 +719,9 @@ class MiddlePointTorchEnv(BatchEnv):
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Restart the random number generator of all plants with the seed, if there is one."""
-        if seed is not None and not (is_count(seed) and seed < 1 << 63):
-            reject("seed", seed, "None or an integer from 0 to 2^63 - 1")
         if seed is not None:
-            self._generator.manual_seed(int(seed))
+            largest_seed = (1 << 63) - 1
+            self._generator.manual_seed(count("seed", seed, 0, largest_seed))
         self._np_random_seed = self._generator.initial_seed()
 
     def _checked_actions(self, actions: Any) -> Tensor:

@@ -95,13 +95,11 @@ def assert_close(ours, theirs, rtol, atol, name=""):
         for key in theirs:
             assert_close(ours[key], theirs[key], rtol, atol, key)
         return
-    if name == "final_obs":
-        none = np.zeros(ours.shape[1:])
-        theirs = np.array([none if each is None else each for each in theirs], np.float32)
     ours = ours.detach().numpy()
+    if name == "final_obs":
+        theirs = np.array([np.zeros(ours.shape[1]) if row is None else row for row in theirs])
     assert (ours.shape, ours.dtype == bool) == (theirs.shape, theirs.dtype == bool), name
-    bounds = atol + rtol * np.abs(theirs)
-    assert (np.abs(ours - 1.0 * theirs) <= bounds).all(), (name, ours, theirs)
+    np.testing.assert_allclose(1.0 * ours, 1.0 * theirs, rtol, atol, err_msg=name)
 
 
 def assert_equals_numpy(n, rng, steps, partial_resets, tolerances, own, **shared):
@@ -165,10 +163,6 @@ def test_a_command_on_the_edge_of_the_dead_zone_passes(rng, dtype):
     for actions in (exact, float32_action(commands, -10.0, 10.0, zones)):
         infos = env.step(torch.tensor(actions)[:, None])[-1]
         np.testing.assert_allclose(infos["applied"], commands, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_a_change_that_is_rounded_does_not_fall_into_the_compensated_dead_zone(dtype):
     # In float32, the action 0.7 commands 6.9999999 t/h.
     env = make(2, dtype=dtype, **CHANGE | {"dead_zone": 7.0, "compensated_dead_zone": 7.0})
     env.reset()
@@ -176,36 +170,33 @@ def test_a_change_that_is_rounded_does_not_fall_into_the_compensated_dead_zone(d
     np.testing.assert_allclose(infos["applied"], [7.0, -7.0], rtol=1e-6)
 
 
-def test_draws_have_the_distributions_of_numpy(rng):
+def test_draws_have_the_distributions_of_numpy():
     n = 10_000
-    arguments = {**HARD, "setpoint_period": 90, "delay": [12, 24]}
-    samples = []
+    arguments = {**HARD, "setpoint_period": 90}
+    drawn = []
     for env, zeros in (
         (MiddlePointVectorEnv(n, **arguments), np.zeros((n, 1))),
         (MiddlePointTorchEnv(n, **arguments), torch.zeros(n, 1)),
     ):
-        infos = env.reset(seed=0)[1]
-        values = {f"{name} at 0": infos[name] for name in (*env.parameters.ranges, "setpoint")}
+        _, infos = env.reset(seed=0)
+        values = {name: infos[name] for name in (*env.parameters.ranges, "setpoint")}
         for k in range(1, 41):
             observations, *_, infos = env.step(zeros)
             if k in (1, 2, 40):
-                names = ("setpoint", "noise", "disturbance", "gain_factor", "output")
+                infos["reading"] = infos["setpoint"] - observations[:, 3]
+                names = "setpoint", "noise", "disturbance", "gain_factor", "output", "reading"
                 values |= {f"{name} at {k}": infos[name] for name in names}
-                values[f"reading at {k}"] = infos["setpoint"] - observations[:, 3]
-        samples.append(
-            {name: np.asarray(value).astype(float) for name, value in values.items()}
-        )
-    theirs, ours = samples
-    assert ours.keys() == theirs.keys()
-    for name in theirs:
+        drawn.append({name: np.asarray(value).astype(float) for name, value in values.items()})
+    for name, theirs in drawn[0].items():
+        ours = drawn[1][name]
         for power in (1, 2):  # mean and variance
-            means = [(each[name] - theirs[name].mean()) ** power for each in samples]
-            difference = abs(means[0].mean() - means[1].mean())
-            assert difference <= 5 * (2 / n) ** 0.5 * means[0].std(), name
+            moments = [(values - theirs.mean()) ** power for values in (ours, theirs)]
+            difference = abs(moments[0].mean() - moments[1].mean())
+            assert difference <= 5 * (2 / n) ** 0.5 * moments[1].std(), name
         for share in (0.01, 0.99):
-            percentile = np.quantile(theirs[name], share)
-            shares = [(each[name] <= percentile).mean() for each in samples]
-            assert abs(shares[0] - shares[1]) <= 5 * (2 * share * (1 - share) / n) ** 0.5, name
+            percentile = np.quantile(theirs, share)
+            difference = abs((ours <= percentile).mean() - (theirs <= percentile).mean())
+            assert difference <= 5 * (2 * share * (1 - share) / n) ** 0.5, name
 
 
 class TestGradients:
@@ -248,7 +239,7 @@ class TestGradients:
         env.reset()
         actions = torch.zeros(1, 1, requires_grad=True)
         env.step(actions)[-1]["output"].backward()
-        assert actions.grad.item() < 0.0
+        assert actions.grad < 0.0
 
     def test_detach_cuts_what_was_before_and_nothing_else(self):
         totals, gradients = [], []
@@ -278,14 +269,14 @@ class TestGradients:
         env.reset(seed=0)
         weight = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
         counts = []
-        for steps in (20, 70):
-            for _ in range(steps):
-                observation, reward, *_, infos = env.step(torch.full((3, 1), 0.7) * weight)
-                returned = observation, reward, *infos.values()
-                assert any(each.requires_grad for each in returned) is differentiable
-                env.detach()
-            gc.collect()
-            counts.append(sum(type(each) is torch.Tensor for each in gc.get_objects()))
+        for k in range(90):
+            observation, reward, *_, infos = env.step(torch.full((3, 1), 0.7) * weight)
+            returned = observation, reward, *infos.values()
+            assert any(tensor.requires_grad for tensor in returned) is differentiable
+            env.detach()
+            if k in (20, 89):
+                gc.collect()
+                counts.append(sum(type(thing) is torch.Tensor for thing in gc.get_objects()))
         assert counts[1] < counts[0] + 400  # in a block they rise and fall by 250
 
 
@@ -326,27 +317,22 @@ def test_a_step_never_waits_for_the_device(arguments):
 
 def test_types_and_seeds_beyond_those_of_pytorch_are_named():
     with pytest.raises(ValueError, match=r"^dtype must be"):
-        MiddlePointTorchEnv(2, dtype=torch.float16)
-    env = make()
-    env.reset(seed=(1 << 63) - 1)  # the largest
-    assert env.np_random_seed == (1 << 63) - 1
-    with pytest.raises(ValueError, match=r"^seed must be None or an integer"):
-        env.reset(seed=1 << 63)
+        make(dtype=torch.float16)
+    with pytest.raises(ValueError, match=r"^seed must be an integer from 0 to 9,223,372"):
+        make().reset(seed=1 << 63)
 
 
 def test_by_id_it_is_that_of_the_id():
     env = make_vec(
-        "MiddlePointHard-v0", 3, dtype=torch.float64, delay=[2, 4], max_episode_steps=9
+        "MiddlePointHard-v0", 3, dtype=torch.float64, delay=[2, 4], max_episode_steps=2
     )
-    assert env.parameters == gymnasium.make(env.spec).unwrapped.parameters
-    assert env.spec.id == "MiddlePointHard-v0"
-    assert env.spec.max_episode_steps == 9
-    assert env.dtype is torch.float64
+    one = gymnasium.make(env.spec)
+    assert env.parameters == one.unwrapped.parameters
+    assert one.spec.max_episode_steps == 2
     env.reset(seed=0)
-    ended = [env.step(torch.zeros(3, 1))[3].all().item() for _ in range(9)]
-    assert ended == [False] * 8 + [True]
-    drawn = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array", dead_zone=[1, 2])
-    assert make_vec(drawn.spec, 2).parameters == drawn.unwrapped.parameters
+    assert [env.step(torch.zeros(3, 1))[3].all() for _ in range(2)] == [False, True]
+    pictured = gymnasium.make("MiddlePoint-v0", render_mode="rgb_array", dead_zone=[1, 2])
+    assert make_vec(pictured.spec, 2).parameters == pictured.unwrapped.parameters
     with pytest.raises(ValueError, match="spec of a MiddlePointEnv, without wrappers"):
         make_vec("CartPole-v1", 2)
 
