@@ -109,23 +109,18 @@ def _act_by_predict(predict: Callable[..., Any], n: int) -> Act:
     The state that `predict` returns, such as that of a recurrent network, is passed to the next
     call. Of the keywords of Stable-Baselines3, `predict` receives those that it takes.
     """
-    accepted = inspect.signature(predict).parameters.values()
-    takes_any = any(argument.kind is argument.VAR_KEYWORD for argument in accepted)
-    names = {argument.name for argument in accepted}
+    accepted = inspect.signature(predict).parameters
+    takes_any = any(argument.kind is argument.VAR_KEYWORD for argument in accepted.values())
     keywords = {"state": None, "episode_start": np.ones(n, np.bool_), "deterministic": True}
-    keywords = {name: keywords[name] for name in keywords if takes_any or name in names}
+    names = [name for name in keywords if takes_any or name in accepted]
 
     def act(observations: Any) -> Any:
         """Return the actions from `predict`, and keep the returned state for the next call."""
-        returned = predict(observations, **keywords)
-        if "episode_start" in keywords:
-            keywords["episode_start"] = np.zeros(n, np.bool_)
-        if not isinstance(returned, tuple):
-            return returned
-        actions, state = returned
-        if "state" in keywords:
-            keywords["state"] = state
-        return actions
+        returned = predict(observations, **{name: keywords[name] for name in names})
+        keywords["episode_start"] = np.zeros(n, np.bool_)
+        if isinstance(returned, tuple):
+            returned, keywords["state"] = returned
+        return returned
 
     return act
 
