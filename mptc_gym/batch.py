@@ -48,6 +48,9 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
     ----------
     _where : callable
         The function `numpy.where` or `torch.where`, which a subclass sets.
+    _as_array : callable
+        A function or method of a subclass, which copies a NumPy array, shape (num_envs,), to a
+        new NumPy array or PyTorch tensor.
     _window
         The object that stores the observations, which a subclass of `BatchEnv` sets.
         `_window.present()` returns a copy of the present observations, shape (num_envs, size).
@@ -56,6 +59,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
     """
 
     _where: Any
+    _as_array: Any
     _window: Any
     _zeros: Array
 
@@ -252,10 +256,6 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             allowed = f"an array of bool, shape ({self.num_envs},), at least one of them True"
             reject("options['reset_mask']", options["reset_mask"], allowed)
         return mask.copy()
-
-    @abstractmethod
-    def _as_array(self, values: NDArray[Any]) -> Array:
-        """Copy a NumPy array, shape (num_envs,), to a new NumPy array or PyTorch tensor."""
 
     @abstractmethod
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:

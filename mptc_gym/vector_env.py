@@ -83,6 +83,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
     metadata: dict[str, Any] = MiddlePointEnv.metadata | {"render_modes": ["rgb_array"]}
     _where = staticmethod(np.where)
+    _as_array = staticmethod(np.array)  # which copies an array
 
     def __init__(
         self,
@@ -267,10 +268,6 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         for i in np.flatnonzero(ended):
             final_observations[i] = observations[i].copy()
         return final_observations
-
-    def _as_array(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return a copy of the array `values`, shape (num_envs,)."""
-        return values.copy()
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Restart the random number streams of the plants in `mask` that have a seed."""
