@@ -1,6 +1,6 @@
 """Train PPO of Stable-Baselines3 to control the plant, in a quarter of a minute on one core.
 
-`python benchmarks/examples/sb3.py` trains a policy, saves the policy in `ppo-0.zip`, and prints
+`python benchmarks/examples/sb3.py` trains a policy, saves the policy in `ppo.zip`, and prints
 the policy's scores. A score is 0 for a valve that never moves, and 1 for the least possible
 error.
 
@@ -25,7 +25,6 @@ Four choices make the training of PPO fast:
 
 import argparse
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -175,19 +174,17 @@ def main() -> None:
     """Train a policy by PPO, save the policy, and print the policy's scores."""
     parser = argparse.ArgumentParser(description="PPO of Stable-Baselines3 on 512 plants.")
     parser.add_argument("--steps", type=int, default=1_000_000, help="samples of experience")
-    parser.add_argument("--seed", type=int, default=0, help="seed of policy and plants")
-    parser.add_argument("--out", type=Path, default=Path(), help="folder of the policy")
-    options = parser.parse_args()
+    steps = parser.parse_args().steps
 
     torch.set_num_threads(1)  # the networks are too small for more
     # Each group of `GROUP` plants has the same noise and set points.
     plants = make_vec_env("MiddlePoint-v0", 512, group=GROUP, **PLANTS)
     layers = {"pi": [], "vf": [64, 64]}  # a linear policy; a value function of two layers
     # `Changes` converts an observation to the inputs of the networks.
-    model = make_ppo(plants, options.seed, features_extractor_class=Changes, net_arch=layers)
+    model = make_ppo(plants, seed=0, features_extractor_class=Changes, net_arch=layers)
     # The standard deviation of the actions falls from exp(-1.2) to exp(-4.0).
-    model.learn(options.steps, Exploration(first=-1.2, last=-4.0))
-    model.save(options.out / f"ppo-{options.seed}.zip")
+    model.learn(steps, Exploration(first=-1.2, last=-4.0))
+    model.save("ppo.zip")
     for env in ("MiddlePoint-v0", "MiddlePointNoisy-v0"):
         print(evaluate(model, env))
 
