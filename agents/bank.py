@@ -237,6 +237,7 @@ class Bank:
         if self._k % ESTIMATE_INTERVAL == 0:
             self._renew_estimates()
         present = self._mean(self._delayed[:-1])
+        # One delay further on are the outputs s(k - 1 - d) of the previous sample.
         previous = self._mean(self._delayed[1:])
         self.responses = np.stack([present, previous])
 

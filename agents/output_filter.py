@@ -70,8 +70,6 @@ class OutputFilter:
     load : ndarray
         Estimated load disturbance w, in units of the steady temperature change for half the
         flow range, shape (n,).
-    weights : ndarray
-        Probabilities of the Kalman filters, shape (filters, n).
     """
 
     def __init__(self, n: int) -> None:
@@ -221,8 +219,9 @@ class OutputFilter:
         losses = np.square(errors) / variances + np.log(variances)
         self._log_likelihoods *= FILTER_FORGETTING
         self._log_likelihoods -= 0.5 * LIKELIHOOD_FACTOR * losses
+        # Probabilities of the filters of each plant, shape (filters, n).
         weights = np.exp(self._log_likelihoods - self._log_likelihoods.max(0))
-        self.weights = weights / weights.sum(0)
-        self._mean_state = np.einsum("fn,fni->in", self.weights, self._states)
+        weights /= weights.sum(0)
+        self._mean_state = np.einsum("fn,fni->in", weights, self._states)  # shape (4, n)
         self.load = self._mean_state[LOAD]
         self.gain = np.clip(self._mean_state[GAIN], *GAIN_LIMITS)
