@@ -25,8 +25,9 @@ def estimate(runs: pd.DataFrame, bounds: Sequence[Bound]) -> pd.DataFrame:
     runs : pandas.DataFrame
         Table with a row for each run, and the columns `scenario`, `agent` (the controller),
         `policy` (the number of the controller's member), `seed` and `mae` (the mean absolute
-        error of the run, degC). The controller in the first row is the reference controller,
-        with which all other controllers are compared.
+        error of the run, degC). The rows of a controller in a scenario are in the order of its
+        members, and of their seeds. The controller in the first row is the reference
+        controller, with which all other controllers are compared.
     bounds : sequence of Bound
         Least possible errors. A scenario that has none is left out of the result.
 
@@ -76,11 +77,10 @@ def errors_by_agent(runs: pd.DataFrame) -> dict[str, NDArray[np.float64]]:
 
     `runs` is a table with the rows of one scenario.
     """
-    errors = {}
-    for agent, rows in runs.groupby("agent", sort=False):
-        table = rows.pivot_table(index="policy", columns="seed", values="mae")
-        errors[str(agent)] = table.to_numpy()
-    return errors
+    return {
+        str(agent): rows["mae"].to_numpy().reshape(rows["policy"].nunique(), -1)
+        for agent, rows in runs.groupby("agent", sort=False)
+    }
 
 
 def ranked(estimates: pd.DataFrame) -> dict[str, Estimate]:

@@ -6,6 +6,7 @@ processes, which need no pandas, as pandas takes long to import.
 """
 
 import itertools
+import operator
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -69,14 +70,15 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     start = time.process_time()
     are_equal = not (controller.random or is_random(scenario.parameters))
     simulated_runs = 1 if are_equal else runs
-    members = [
+    members = [  # pairs of a controller and the arguments of its environment
         member.start(scenario.arguments, simulated_runs, seed)
         for member in controller.members()
     ]
     trajectories = []
-    # The members of a user's controller may need different arguments of the environment.
-    for arguments, group in itertools.groupby(members, key=lambda member: member[1]):
-        agents = [agent for agent, _ in group]
+    # Members act in one batch of plants, which saves time. Only the members of a user's
+    # controller may need different arguments of the environment, and so several batches.
+    for arguments, neighbours in itertools.groupby(members, key=operator.itemgetter(1)):
+        agents = [agent for agent, _ in neighbours]
         trajectories += rollout_together(
             agents, simulated_runs, scenario.samples, seed, **arguments
         )
@@ -89,7 +91,7 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
             "seed": range(seed, seed + runs),
         }
         for name, values in measure(trajectory, scenario.parameters).items():
-            columns[name] = np.broadcast_to(values, runs)
+            columns[name] = np.broadcast_to(values, runs)  # The values may be of a single run.
         tables.append(columns)
     first_agent, _ = members[0]
     sensitivity = None

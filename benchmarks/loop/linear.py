@@ -76,6 +76,7 @@ class LinearModel:
         self, parameters: Parameters, numbers: PlantNumbers[Any], k: int | NDArray[np.int64]
     ) -> None:
         dynamics = Dynamics(parameters)
+        # The factors of a plant that drifts are constant for `DRIFT_INTERVAL` samples.
         gain, time_constant = dynamics.factors(numbers, k // DRIFT_INTERVAL * DRIFT_INTERVAL)
         alpha, scale, load = dynamics.coefficients(gain, time_constant)
         shape = np.broadcast_shapes(np.shape(gain), np.shape(time_constant))
