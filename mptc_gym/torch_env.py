@@ -65,8 +65,9 @@ def _uniform(low: float, high: float, zeros: Tensor, generator: torch.Generator)
     The numbers have the shape of `zeros`, and the device and the type of `zeros` or int64.
     """
     if isinstance(low, int):
-        ends = low, int(high) + 1
-        return torch.randint(*ends, zeros.shape, generator=generator, device=zeros.device)
+        return torch.randint(
+            low, int(high) + 1, zeros.shape, generator=generator, device=zeros.device
+        )
     return torch.empty_like(zeros).uniform_(low, high, generator=generator)
 
 
@@ -119,6 +120,7 @@ class _Noise(_Signal):
         return noise
 
     def end_block(self, samples: int) -> None:
+        # As many values up to the present sample as C needs.
         self._xi = self._xi[samples : samples + len(self._c) - 1]
 
 
@@ -157,15 +159,14 @@ class _RandomSetPoint(_Signal):
         self._end = self._next_end = self._zeros.to(torch.int64)
 
     def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
-        # Samples of the block that has ended may have been on the next level of other plants.
-        self._begin_next_levels(k)
+        self._begin_next_levels(k)  # those of the block that a reset of some plants ends
         levels, lengths = self._draw()
         self._level = torch.where(mask, levels, self._level)
         self._end = torch.where(mask, lengths, self._end)
         return self._level
 
     def next(self, samples: int, k: SampleNumber) -> Tensor:
-        self._begin_next_levels(k - 1)
+        self._begin_next_levels(k - 1)  # those of the block before
         self._next_level, lengths = self._draw()
         self._next_end = self._end + lengths
         rows = torch.arange(samples, device=self._end.device)[:, None]
@@ -231,12 +232,11 @@ class _WantedFlows(WantedFlows):
         """Return the actions that `float32_action` returns in NumPy, with gradients."""
         actions = action_from_command(commands, self._u_min, self._u_max).to(torch.float32)
         rounded_commands = (actions.to(commands.dtype) + 1.0) * self._half_range + self._u_min
-        has_lost_effect = rounded_commands.abs() < self._dead_zone
-        has_lost_effect &= commands.abs() >= self._dead_zone
+        had_effect = commands.abs() >= self._dead_zone
         size = actions.detach().abs().clamp(min=1.0)
         spacing = torch.nextafter(size, 2.0 * size) - size  # of float32 numbers
-        moves = has_lost_effect * spacing.copysign(commands.detach())
-        return (actions + moves).to(commands.dtype)
+        is_lost = had_effect & (rounded_commands.abs() < self._dead_zone)
+        return (actions + is_lost * spacing.copysign(commands.detach())).to(commands.dtype)
 
 
 class _Plants:
@@ -264,8 +264,8 @@ class _Plants:
         self._middle = zeros.new_tensor(sum(self._limits) / 2.0)
         self._shortest_delay, self._longest_delay = map(int, parameters.range_of("delay"))
         self.most_samples = self._shortest_delay + 1
-        # The applied flows that terms of the polynomial B still need, t/h, the oldest first:
-        # the first is u_a(k-d) for the longest delay d and the last term of B.
+        # The applied flows that the polynomial B still needs, t/h, the oldest first. The first
+        # of them is that of the longest delay and the last term of B.
         flows = self._longest_delay + len(parameters.b)
         self._flows = deque([zeros] * flows, flows)
         # Temperatures of the samples before the latest block, which A needs, and of the block.
@@ -316,9 +316,9 @@ class _Plants:
     def next(self, samples: int, k: SampleNumber, noise: Tensor, load: Tensor | None) -> Tensor:
         """Return the temperatures y at the next samples, degC, shape (samples, n).
 
-        `samples` is at most `most_samples`, and k is the first of these samples, which follows
-        the latest action. `noise` and `load` hold the coloured
-        noise n and the load w, degC, shape (samples, n); None is a load that is always 0.
+        `samples` is at most `most_samples`. The first of these samples, k, follows the latest
+        action. `noise` and `load` hold the coloured noise n and the load w, degC, shape
+        (samples, n); None is a load that is always 0.
         """
         if self._parameters.drifts:
             self._update_dynamics(k)
@@ -334,6 +334,7 @@ class _Plants:
 
     def end_block(self, samples: int) -> None:
         """Forget the latest block, except for its first samples, which steps have returned."""
+        # As many temperatures up to the present sample as A needs.
         order = len(self._parameters.a) - 1
         self._outputs = self._outputs[samples : samples + order]
 
@@ -614,8 +615,7 @@ class MiddlePointTorchEnv(BatchEnv):
         if move_weight:
             rewards = rewards - move_weight * (a - self._action).abs()
             self._action = a.clone()  # a copy, as the caller may overwrite the actions
-        infos["command"] = command
-        infos["applied"] = applied
+        infos |= {"command": command, "applied": applied}
         return observations, rewards, infos.pop("terminations"), infos.pop("truncations"), infos
 
     def _compute_block(self) -> None:
@@ -720,8 +720,7 @@ class MiddlePointTorchEnv(BatchEnv):
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Restart the random number generator of all plants with the seed, if there is one."""
         if seed is not None:
-            largest_seed = (1 << 63) - 1
-            self._generator.manual_seed(count("seed", seed, 0, largest_seed))
+            self._generator.manual_seed(count("seed", seed, 0, maximum=(1 << 63) - 1))
         self._np_random_seed = self._generator.initial_seed()
 
     def _checked_actions(self, actions: Any) -> Tensor:
