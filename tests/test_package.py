@@ -64,7 +64,7 @@ TRAININGS = [(code, printed) for code, printed in BLOCKS if printed and ".learn(
 EXAMPLES = [block for block in BLOCKS if block not in TRAININGS]
 
 
-COMPARE = {  # the packages of the extra "compare"
+COMPARE = {  # the packages of the extra "compare" that the benchmarks import
     "cyclopts", "joblib", "matplotlib", "pandas", "rich", "scipy", "tabulate",
 }  # fmt: skip
 
