@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import re
 
 import pytest
 
@@ -15,8 +14,6 @@ from benchmarks.lib.seeds import SEEDS
 from benchmarks.train import __main__ as train
 from mptc_gym import evaluation
 from tests.conftest import ROOT
-
-PAGES = [ROOT / "README.md", *ROOT.glob("*/**/*.md")]
 
 
 def block_of(seed):
@@ -51,17 +48,6 @@ def test_policies_are_chosen_and_trained_where_nothing_is_published():
     ppo = pytest.importorskip("benchmarks.train.ppo", reason="PPO needs an extra")
     assert block_of(ppo.VALIDATION_SEED + evaluation.EPISODES - 1) == "validation"
     assert block_of(ppo.TRAINING_SEEDS + (1 << 32) - 1) == "training"
-
-
-def test_pages_name_seeds_of_the_table():
-    sentences = [
-        words
-        for page in PAGES
-        for words in re.findall(r"seeds?\b[^.\n|]*", page.read_text("utf-8"))
-    ]
-    named = re.findall(r"\d{1,3}(?:,\d{3}){2,}", " ".join(sentences))
-    blocks = {block_of(int(seed.replace(",", ""))) for seed in named}
-    assert blocks == {"published", "validation", "trials"}
 
 
 def test_published_files_have_the_seeds_of_the_table():

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from benchmarks.lib import statistics
 from benchmarks.lib.statistics import bootstrap, quantile, share
@@ -40,26 +39,10 @@ def test_the_interval_of_two_values_is_wide():
     assert statistics.student([1.0, 3.0]).high == pytest.approx(2.0 + 12.706, abs=1e-3)
 
 
-def test_share_by_hand():
-    # Wilson: (p + z^2/2n +- z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n)
+def test_the_share_has_wilsons_interval():
     estimate = share(np.array([True] * 8 + [False] * 2))
-    z, p, n = 1.959964, 0.8, 10
-    half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
-    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     assert estimate.value == 0.8
-    assert (estimate.low, estimate.high) == pytest.approx((middle - half, middle + half))
-
-
-@pytest.mark.parametrize("how", ["upper", "share"])
-def test_intervals_hold_the_truth_as_often_as_they_promise(how, rng):
-    trials, held = 250, 0
-    for _ in range(trials):
-        if how == "share":
-            estimate, truth = share(rng.random(80) < 0.3), 0.3
-        else:
-            estimate, truth = quantile(rng.exponential(size=80), 0.8), stats.expon.ppf(0.8)
-        held += estimate.low <= truth <= estimate.high
-    assert 0.92 <= held / trials <= 0.99  # 95 %, and a little more as counts are whole
+    assert (estimate.low, estimate.high) == pytest.approx((0.490, 0.943), abs=1e-3)
 
 
 class TestBootstrap:

@@ -18,7 +18,7 @@ from matplotlib.ticker import NullLocator
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.controllers.roster import ControllerSpec
-from benchmarks.lib.pictures import AT_LEAST, AT_MOST, DEAD_ZONE, LIMIT, SETPOINT, open_picture
+from benchmarks.lib.pictures import DEAD_ZONE, LIMIT, SETPOINT, open_picture
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
@@ -83,7 +83,7 @@ def plot_scores(
         axes.set_ylim(len(scores) - 0.5, -0.5)  # The first controller has the top row.
         axes.set_xscale("log")
         lowest, *others, highest = [f"{tick:g}" for tick in SCORE_TICKS]
-        tick_labels = [f"{AT_MOST} {lowest}", *others, f"{AT_LEAST} {highest}"]
+        tick_labels = [f"≤ {lowest}", *others, f"≥ {highest}"]
         axes.set_xticks(distance(SCORE_TICKS), tick_labels)
         axes.set_xlim(1.15, 0.00087)
         axes.xaxis.set_minor_locator(NullLocator())

@@ -41,10 +41,6 @@ SETPOINT: Any = {"color": "black", "linestyle": "--", "linewidth": 0.8}
 DEAD_ZONE: Any = {"color": "0.5", "alpha": 0.2, "linewidth": 0}
 LIMIT: Any = {"color": "0.4", "linestyle": ":", "linewidth": 1.0}
 
-# The signs for "at most" and "at least" at the ticks of an axis.
-AT_MOST = "\N{LESS-THAN OR EQUAL TO}"
-AT_LEAST = "\N{GREATER-THAN OR EQUAL TO}"
-
 
 @contextmanager
 def open_picture(path: Path, height: float, title: str) -> Iterator[Figure]:
