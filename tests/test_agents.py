@@ -20,8 +20,10 @@ from agents import (
     Weights,
 )
 from agents.networks import PRETRAINED
+from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop.measures import make_plants, rollout
-from mptc_gym import Parameters
+from mptc_gym import PRESETS, Parameters, evaluate
+from mptc_gym.evaluation import SEED
 from tests.conftest import STEP_TEST, assert_the_seed_is_all_that_differs
 
 FIELDS = ("W", "theta_1", "W_1", "theta_2")
@@ -126,6 +128,21 @@ def test_some_controllers_refuse_more_plants():
     ):
         with pytest.raises(ValueError, match=complaint):
             network.check_environment(Parameters(**network.interface | other), 5)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("nn", 1.9493986), ("pi-simc", 1.7787785), ("smith", 1.5552472), ("dahlin", 1.5607959),
+        ("self-tuning", 1.3848060), ("ppo", 1.5119368), ("ppo-hard", 1.4632752),
+    ],
+)  # fmt: skip
+def test_errors_on_random_plants_are_those_of_earlier_versions(name, error):
+    member = ROSTER[name].members()[0]
+    controller, arguments = member.start(PRESETS["hard"], 10, SEED)
+    result = evaluate(controller, episodes=10, **arguments)
+    # float32 results of the bank and of networks can differ by rounding between machines.
+    assert result.mean_error == pytest.approx(error, rel=1e-5)
 
 
 class TestDirectNN:

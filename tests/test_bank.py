@@ -5,11 +5,7 @@ import pytest
 from scipy import signal
 
 from agents import SelfTuningController, output_filter
-from agents.bank import (
-    FAST_POLE,
-    GAIN_SPREAD,
-    NOISE_COLOUR,
-)
+from agents.bank import FAST_POLE, GAIN_SPREAD, NOISE_COLOUR
 from agents.hedge import RandomSetpoint
 from agents.output_filter import LOAD_MEMORY, READING_SHARE, OutputFilter
 from benchmarks.loop.measures import make_plants, rollout
@@ -46,54 +42,34 @@ def test_it_identifies_the_plant(delay, gain, time_constant, noise):
     assert estimates["time_constant"] == pytest.approx(constant, rel=0.25)
 
 
-class TestOutputFilter:
-    POLE, VARIANCE, SAMPLES = 0.95, 0.04, 60
-
-    def filtered(self, responses, outputs):
-        """Return the filter after all samples of one plant."""
-        kalman = OutputFilter(1)
-        pole, variance = np.array([self.POLE]), np.array([self.VARIANCE])
-        for k in range(1, len(outputs)):
-            newest = responses[[k, k - 1], np.newaxis]
-            kalman.update(outputs[[k]], newest, pole, variance)
-        return kalman
-
-    def test_gain_and_load_are_those_of_all_samples_at_once(self, rng, monkeypatch):
-        # The unknowns and the outputs are jointly normal: condition them in one step.
-        change, drift = 0.02, output_filter.GAIN_CHANGE * GAIN_SPREAD
-        monkeypatch.setattr(output_filter, "LOAD_CHANGES", np.array([change]))
-        monkeypatch.setattr(output_filter, "NOISE_SHARES", np.array([1.0]))
-        samples = self.SAMPLES
-        responses = np.concatenate([[0.0], np.cumsum(rng.normal(size=samples)) / 5.0])
-        outputs = 1.1 * responses + 0.2 * rng.normal(size=samples + 1)
-        a1, a2 = self.POLE + FAST_POLE, -self.POLE * FAST_POLE
-        # Responses of v(k), k = 1 to the last, to unit xi(j) and eta(j), in column j.
-        units, of_v = np.eye(samples), [1.0, -a1, -a2]
-        of_noise = signal.lfilter([1.0, NOISE_COLOUR[0]], of_v, units, axis=0)
-        w = signal.lfilter([1.0], [1.0, -LOAD_MEMORY], units, axis=0)
-        of_load = signal.lfilter([1.0 - a1 - a2], of_v, w, axis=0)
-        s = responses[1:]
-        walks = np.minimum.outer(np.arange(1, samples + 1), np.arange(1, samples + 1))
-        gains = GAIN_SPREAD**2 + drift**2 * walks
-        covariance = (1.0 - READING_SHARE) * self.VARIANCE * of_noise @ of_noise.T
-        covariance += change**2 * of_load @ of_load.T + s[:, None] * gains * s
-        covariance += READING_SHARE * self.VARIANCE * np.eye(samples)
-        surprise = np.linalg.solve(covariance, outputs[1:] - s)
-        kalman = self.filtered(responses, outputs)
-        assert kalman.gain[0] == pytest.approx(1.0 + gains[-1] * s @ surprise, abs=1e-9)
-        load = change**2 * (of_load @ w[-1]) @ surprise
-        assert kalman.load[0] == pytest.approx(load, abs=1e-9)
-
-    def test_a_load_remains_in_the_forecast_and_noise_does_not(self):
-        pole, fading = np.array([self.POLE]), np.array([self.POLE**19])
-        steady = np.full(200, 0.7)
-        pulse = np.where(np.arange(200) == 199, 0.7, 0.0)
-        loaded, disturbed = (
-            self.filtered(np.zeros(200), outputs) for outputs in (steady, pulse)
-        )
-        assert 0.55 < loaded.forecast(pole, fading)[0] < 0.7
-        later, soon = (disturbed.forecast(pole, share)[0] for share in (fading, pole))
-        assert 0.0 < later < min(soon, 0.3)
+def test_gain_and_load_are_those_of_all_samples_at_once(rng, monkeypatch):
+    # The unknowns and the outputs are jointly normal: condition them in one step.
+    pole, variance, samples = 0.95, 0.04, 60
+    change, drift = 0.02, output_filter.GAIN_CHANGE * GAIN_SPREAD
+    monkeypatch.setattr(output_filter, "LOAD_CHANGES", np.array([change]))
+    monkeypatch.setattr(output_filter, "NOISE_SHARES", np.array([1.0]))
+    responses = np.cumsum(rng.normal(size=samples)) / 5.0
+    outputs = 1.1 * responses + 0.2 * rng.normal(size=samples)
+    kalman = OutputFilter(1)
+    for output, response, last in zip(outputs, responses, [0.0, *responses], strict=False):
+        newest = np.array([[response], [last]])
+        kalman.update(np.array([output]), newest, np.array([pole]), np.array([variance]))
+    a1, a2 = pole + FAST_POLE, -pole * FAST_POLE
+    # Responses of v(k), k = 1 to the last, to unit xi(j) and eta(j), in column j.
+    units, of_v = np.eye(samples), [1.0, -a1, -a2]
+    of_noise = signal.lfilter([1.0, NOISE_COLOUR[0]], of_v, units, axis=0)
+    w = signal.lfilter([1.0], [1.0, -LOAD_MEMORY], units, axis=0)
+    of_load = signal.lfilter([1.0 - a1 - a2], of_v, w, axis=0)
+    walks = np.minimum.outer(np.arange(1, samples + 1), np.arange(1, samples + 1))
+    gains = GAIN_SPREAD**2 + drift**2 * walks
+    covariance = (1.0 - READING_SHARE) * variance * of_noise @ of_noise.T
+    covariance += change**2 * of_load @ of_load.T + responses[:, None] * gains * responses
+    covariance += READING_SHARE * variance * np.eye(samples)
+    surprise = np.linalg.solve(covariance, outputs - responses)
+    gain = 1.0 + gains[-1] * responses @ surprise
+    assert kalman.gain[0] == pytest.approx(gain, abs=1e-9)
+    load = change**2 * (of_load @ w[-1]) @ surprise
+    assert kalman.load[0] == pytest.approx(load, abs=1e-9)
 
 
 class TestRandomSetpoint:
