@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import (
 from agents import DirectNNController, PIController
 from mptc_gym import MiddlePointEnv, MiddlePointVectorEnv, evaluate
 from mptc_gym.evaluation import SEED
-from mptc_gym.sb3 import GymnasiumVecEnv, make_vec_env
+from mptc_gym.sb3 import GymnasiumVecEnv, like, make_vec_env
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 NOISY = "MiddlePointNoisy-v0"
@@ -281,6 +281,7 @@ def test_a_model_finds_the_interface_of_its_training(algorithm, name):
 
 def test_frames_are_stacked_in_the_order_of_the_training():
     model = model_of(VecFrameStack(trained(VecNormalize(dummy())), 2))
+    assert not like(model, NOISY, **SHORT).venv.training  # of the VecNormalize
     evaluation = evaluate(model, NOISY, episodes=EPISODES, **SHORT)
     made = evaluate(
         model, lambda: VecFrameStack(trained(VecNormalize(dummy())), 2), episodes=EPISODES
@@ -340,6 +341,8 @@ REFUSED = {
         law, lambda: Cheating(seed=5), "of its seeds, whose noise at sample 1 is"),
     "flattering errors": lambda _: (
         law, lambda: Cheating(error=0.1), "whose error at sample 1 is"),
+    "plants that share a seed": lambda _: (
+        law, partial(batch, group=N), "of its seeds, whose noise at sample 1 is"),
     "early ends": lambda _: (law, lambda: Cheating(end=6.5), "end an episode early"),
     "VecNormalize without statistics": lambda _: (
         idle, lambda: VecNormalize(dummy()), r"in VecNormalize, got initial .*load\(path, env"),
