@@ -189,7 +189,8 @@ class WantedFlow(WantedFlows):
             command = -self._dead_zone + self._slope_below * flow
         action = float(np.float32(action_from_command(command, self._u_min, self._u_max)))
         rounded_command = (action + 1.0) * self._half_range + self._u_min
-        if abs(command) >= self._dead_zone > abs(rounded_command):  # rarely
+        # Rarely, rounding moves a command from the edge of the dead zone into the dead zone.
+        if abs(command) >= self._dead_zone > abs(rounded_command):
             return float(self._rounded_actions(command))
         return action
 
