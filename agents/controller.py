@@ -152,6 +152,7 @@ class Controller(ABC):
                 f"policy must have the flow limits of env, u_min={parameters.u_min}, "
                 f"u_max={parameters.u_max}, got {self.u_min}, {self.u_max}"
             )
+        # An observation begins with the windows of set points and errors, each newest first.
         first = 0  # index of the signal's newest sample in the observation
         for signal in ("setpoint", "error"):
             window = getattr(parameters, f"{signal}_window")

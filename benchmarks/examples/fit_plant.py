@@ -72,6 +72,7 @@ def regress(applied: Array, temperature: Array, delay: int, pole: float) -> tupl
         Temperatures of the model minus those of the log, degC.
     """
     # The applied flow, and a step at the first row, which ends the flow before the first row.
+    # Both act delay + 1 rows later. The columns of `signals` belong to the three factors.
     inputs = np.pad([applied, np.ones_like(applied)], ((0, 0), (delay + 1, 0)))
     responses = lfilter([1.0 - pole], [1.0, -pole], inputs[:, : len(applied)])
     signals = np.stack([*responses, np.ones_like(applied)], axis=1)
@@ -87,10 +88,11 @@ def fit_lag(applied: Array, temperature: Array) -> tuple[int, float]:
         return regress(applied, temperature, delay, pole)[1]
 
     delays = range(min(LONGEST_DELAY + 1, len(applied) // 2))
-    # The search begins with a time constant of 20 samples.
+    # The logarithm of the time constant is searched, as the time constant must be positive. The
+    # search begins with 20 samples.
     fits = [least_squares(errors, np.log([20.0]), args=(delay,)) for delay in delays]
-    best = int(np.argmin([fit.cost for fit in fits]))
-    return best, float(np.exp(-1.0 / np.exp(fits[best].x[0])))
+    best_delay = int(np.argmin([fit.cost for fit in fits]))  # as the delays begin at 0
+    return best_delay, float(np.exp(-1.0 / np.exp(fits[best_delay].x[0])))
 
 
 def main(
