@@ -237,7 +237,7 @@ class TestCompare:
         out = compared(option, "--agent", f"{name}=agents:PIController")
         page = (out / "report.md").read_text()
         assert f"| {name} |" in " ".join(page.split())
-        assert f"the pictures show only Dahlin, PPO, NN (1992), PI (1992), {name}." in page
+        assert f"only these controllers: Dahlin, PPO, NN (1992), PI (1992), {name}." in page
         assert (out / "scores.png").exists()
 
     @pytest.mark.usefixtures("undrawn")

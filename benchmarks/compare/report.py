@@ -47,8 +47,8 @@ CASES_TEXT = (
     "Shin (1992)."
 )
 PICTURES_TEXT = (
-    "To remain readable, the pictures show only {}. The file CASE.csv of a case has the "
-    "temperature and the flow of all controllers."
+    "To stay readable, the pictures show only these controllers: {}. The file CASE.csv of a "
+    "case has the temperature and the flow of all controllers."
 )
 SCREEN_TEXT = "score: 0 idle valve, 1 least possible error; cases: error / least possible error"
 LONGEST_LABEL = 16  # largest number of characters of a controller's label on the screen

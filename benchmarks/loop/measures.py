@@ -169,8 +169,8 @@ def rollout_together(
 
     def act(observations: Any) -> Array:
         """Return the actions of all controllers, each from the observations of its runs."""
-        shares = np.split(observations, len(acts))
-        return np.concatenate([act(share) for act, share in zip(acts, shares, strict=True)])
+        parts = zip(acts, np.split(observations, len(acts)), strict=True)
+        return np.concatenate([act_of_agent(part) for act_of_agent, part in parts])
 
     plants = make_plants(len(agents) * runs, samples, **arguments)
     seeds = [*range(seed, seed + runs)] * len(agents)
