@@ -1,7 +1,5 @@
 """Print the least possible mean errors: `python -m benchmarks.bounds --help`."""
 
-import shutil
-import textwrap
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -81,7 +79,7 @@ class Options:
 
 
 def work(options: Options) -> None:
-    """Print a table of least possible mean errors, and an explanation of the columns.
+    """Print a table of least possible mean errors, below an explanation of the columns.
 
     If an error or an interruption ends the computation, the printed table has only the cases
     that are finished. With the option `--package`, write the file `mptc_gym/bounds.json`
@@ -89,7 +87,7 @@ def work(options: Options) -> None:
     """
     import pandas as pd
 
-    from benchmarks.lib.report import on_screen
+    from benchmarks.lib.report import Section, show
 
     cases = options.plant.cases(SCENARIOS | PRESET_SCENARIOS)
     if options.package:
@@ -99,22 +97,12 @@ def work(options: Options) -> None:
     title = "Mean absolute error in °C"
     if options.plant.name:
         title += f", plant: {options.plant.name}"
-    print(f"{title}:", flush=True)
     finished = options.fan_out.run(tasks, "bounds")
-    print(on_screen(pd.DataFrame(list(finished.results.values()))))
-    print(description())
+    columns = [f'- "{heading}": {meaning}' for heading, meaning in COLUMNS.items()]
+    table = pd.DataFrame(list(finished.results.values()))
+    show(Section(f"{title}:", [INTERVALS, *columns], table))
     if finished.error:
         raise finished.error
-
-
-def description() -> str:
-    """Return an explanation of the printed table's columns, wrapped at the terminal's width."""
-    width = shutil.get_terminal_size((150, 24)).columns
-    lines = ["", f"{INTERVALS} The columns of the table are:"]
-    for heading, meaning in COLUMNS.items():
-        text = f'- "{heading}": {meaning}'
-        lines.append(textwrap.fill(text, width, subsequent_indent="  "))
-    return "\n".join(lines)
 
 
 def row(case: Scenario, mpc_runs: int | None) -> dict[str, str]:
