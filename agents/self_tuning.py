@@ -37,7 +37,7 @@ def _time_range(name: str, value: Any) -> tuple[float, float] | None:
     """Return the shortest and the longest time in `value`, s, or None if `value` is None."""
     if value is None:
         return None
-    shortest, longest = (not_negative(name, time) for time in value)
+    shortest, longest = (not_negative(f"each time of {name}", time) for time in value)
     if shortest > longest:
         raise ValueError(f"{name} must begin with the shortest time, got {value!r}")
     return shortest, longest
