@@ -137,8 +137,9 @@ class Options:
 
 def work(options):
     folder = new_folder(options.out, "toy", provenance_of())
-    tasks = {name: partial(time.sleep, options.seconds) for name in "abcd"}
-    finished = options.fan_out.run({"up": partial(print, "up", flush=True)} | tasks, "tasks")
+    rest = partial(time.sleep, options.seconds)
+    tasks = {"a": rest, "up": partial(print, "up", flush=True), "b": rest, "c": rest, "d": rest}
+    finished = options.fan_out.run(tasks, "tasks")
     (folder / "report.md").write_text(f"{len(finished.results)} of 5")
     import matplotlib
     print("5 \N{DEGREE SIGN}C")
