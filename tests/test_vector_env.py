@@ -81,6 +81,7 @@ def test_it_equals_one_environment_after_the_other(
     ("mode", "limit", "steps", "arguments"),
     [
         *((m, 300, 700, {"action_window": 20, "move_weight": 0.1, **NOISY}) for m in MODES),
+        ("NextStep", 1200, 700, PRESETS["hard"]),
         ("NextStep", 150, 400, {"delay": [0, 100], "b": [0.3, -0.2, 0.1]}),
         # An actuator that does not reach zero flow, and one that ends there, at minus zero.
         ("NextStep", 9, 30, {"u_min": 6.0, "u_max": 8.0, "dead_zone": 2.0, "move_weight": 0.5}),
@@ -92,7 +93,9 @@ def test_it_equals_one_environment_after_the_other(
 def test_it_equals_them_over_long_times_and_at_the_edge(mode, limit, steps, arguments, rng):
     native, sync = native_and_sync(3, mode, limit, **{"action_window": 3, **arguments})
     assert_equal(native.reset(seed=5), sync.reset(seed=5))
-    compare(native, sync, steps=steps, rng=rng, partial_resets=0.005)
+    # Signals of one plant are generated for 600 samples at a time, unless a reset comes first.
+    partial_resets = 0.005 if limit < 600 else 0.0
+    compare(native, sync, steps=steps, rng=rng, partial_resets=partial_resets)
 
 
 def test_a_plant_costs_a_few_kib_and_nothing_grows_in_the_long_run():
