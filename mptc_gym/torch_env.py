@@ -74,11 +74,11 @@ def _uniform(low: float, high: float, zeros: Tensor, generator: torch.Generator)
 class _Signal:
     """A signal of n plants, whose random numbers come from the environment's generator.
 
-    Every subclass has two methods. `reset(mask, k, numbers)` begins an episode of the plants in
-    `mask`, which have the parameter values `numbers`, and returns the values at the present
-    sample k, degC, shape (n,). `next(samples, k)` computes a block of successive samples,
-    beginning with sample k, and returns the values, degC, shape (samples, n). No load changes
-    after the first sample of a block.
+    Every subclass has two methods. `reset(mask, numbers)` begins an episode of the plants in
+    `mask`, which have the parameter values `numbers`, and returns the values at k = 0, degC,
+    shape (n,); those of other plants have no meaning. `next(samples, k)` computes a block of
+    successive samples, beginning with sample k, and returns the values, degC, shape (samples,
+    n). No load changes after the first sample of a block.
     """
 
     def __init__(self, zeros: Tensor, generator: torch.Generator) -> None:
@@ -103,7 +103,7 @@ class _Noise(_Signal):
         # White noise of the samples before the latest block, which C needs, and of the block.
         self._xi = [self._zeros] * (len(c) - 1)
 
-    def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
+    def reset(self, mask: Tensor, numbers: PlantNumbers[Any]) -> Tensor:
         self._deviation = getattr(numbers, self._variance_name) ** 0.5
         self._xi = [xi.masked_fill(mask, 0.0) for xi in self._xi]
         return self._zeros
@@ -134,7 +134,7 @@ class _RepeatedSetPoint(_Signal):
         self._ends = torch.tensor(levels.lengths, device=self._levels.device).cumsum(0)
         self._period = sum(levels.lengths)
 
-    def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
+    def reset(self, mask: Tensor, numbers: PlantNumbers[Any]) -> Tensor:
         return self._levels[0].expand(len(mask))
 
     def next(self, samples: int, k: SampleNumber) -> Tensor:
@@ -158,15 +158,17 @@ class _RandomSetPoint(_Signal):
         # The sample numbers k at which the present and the next level end.
         self._end = self._next_end = self._zeros.to(torch.int64)
 
-    def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
-        self._begin_next_levels(k)  # those of the block that a reset of some plants ends
+    def reset(self, mask: Tensor, numbers: PlantNumbers[Any]) -> Tensor:
         levels, lengths = self._draw()
         self._level = torch.where(mask, levels, self._level)
         self._end = torch.where(mask, lengths, self._end)
         return self._level
 
     def next(self, samples: int, k: SampleNumber) -> Tensor:
-        self._begin_next_levels(k - 1)  # those of the block before
+        # Make the next level of the block before the present level where it has begun.
+        has_ended = self._end < k
+        self._level = torch.where(has_ended, self._next_level, self._level)
+        self._end = torch.where(has_ended, self._next_end, self._end)
         self._next_level, lengths = self._draw()
         self._next_end = self._end + lengths
         rows = torch.arange(samples, device=self._end.device)[:, None]
@@ -178,12 +180,6 @@ class _RandomSetPoint(_Signal):
         levels = self._uniform(-distribution.amplitude, distribution.amplitude)
         return levels, self._uniform(distribution.shortest, distribution.longest)
 
-    def _begin_next_levels(self, k: SampleNumber) -> None:
-        """Make the next level the present level of each plant whose level has ended by k."""
-        has_ended = self._end <= k
-        self._level = torch.where(has_ended, self._next_level, self._level)
-        self._end = torch.where(has_ended, self._next_end, self._end)
-
 
 class _Load(_Signal):
     """Load disturbance w(k) of n plants, as `mptc_gym.plant.signals.Disturbance` defines it."""
@@ -192,7 +188,7 @@ class _Load(_Signal):
         super().__init__(*args)
         self._level = self._walk = self._zeros  # a level that jumps, and a random walk, degC
 
-    def reset(self, mask: Tensor, k: SampleNumber, numbers: PlantNumbers[Any]) -> Tensor:
+    def reset(self, mask: Tensor, numbers: PlantNumbers[Any]) -> Tensor:
         self._numbers = numbers
         self._level = self._level.masked_fill(mask, 0.0)
         self._walk = self._walk.masked_fill(mask, 0.0)
@@ -698,7 +694,7 @@ class MiddlePointTorchEnv(BatchEnv):
         self._plants.reset(flags, k, numbers)
         self._wanted_flows.reset(flags)
         first_values = {
-            name: signal.reset(flags, k, numbers) for name, signal in self._signals.items()
+            name: signal.reset(flags, numbers) for name, signal in self._signals.items()
         }
         setpoint = first_values["setpoint"]
         rest_action = self._zeros + action_from_command(0.0, numbers.u_min, numbers.u_max)

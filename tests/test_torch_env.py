@@ -76,7 +76,7 @@ class ReplayedSignal:
     def __init__(self, env, name):
         self.env, self.name = env, name
 
-    def reset(self, mask, k, numbers):
+    def reset(self, mask, numbers):
         return self.env.now(self.name, 0)
 
     def next(self, samples, k):
