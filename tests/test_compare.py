@@ -229,7 +229,7 @@ class TestCompare:
         # The higher score is no better if it is over fewer cases.
         assert page.index("| PI (1992)") < page.index("| Smith")
         for text in (page, printed.out):
-            assert "Scores over fewer cases, as results are missing: Smith." in text
+            assert "\nScores over fewer cases, as results are missing: Smith." in text
 
     def test_all_controllers_beside_one_of_any_name_which_is_always_drawn(self, compared):
         name = "$\\nope$ ../../x"

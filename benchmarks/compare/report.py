@@ -130,7 +130,8 @@ def write(
     finished_cases = estimates["agent"].value_counts()
     labels = [controllers[name].label for name in scores if finished_cases[name] < len(bounds)]
     if labels:
-        note += f" Scores over fewer cases, as results are missing: {', '.join(labels)}."
+        missing = f"Scores over fewer cases, as results are missing: {', '.join(labels)}."
+        note = f"{note} {missing}".strip()
     page = sections(comparison, note)
     write_report(folder, "Comparison of controllers", page, provenance, error)
     return "\n".join(filter(None, [on_screen(comparison), note]))
