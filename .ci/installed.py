@@ -42,6 +42,8 @@ envs = gymnasium.make_vec("MiddlePoint-v0", num_envs=8, noise_variance=0.5)
 envs.reset(seed=0)
 envs.step(envs.action_space.sample())
 
+from mptc_gym.agents import DirectNNController, PIController  # noqa: E402
+
 import mptc_gym  # noqa: E402 (last, since the id above must do without it)
 
 assert Path(mptc_gym.__file__).is_relative_to(sys.prefix), mptc_gym.__file__
@@ -50,4 +52,7 @@ changelog = Path(mptc_gym.__file__).with_name("CHANGELOG.md").read_text(encoding
 assert f"## {installed.version} (" in changelog  # with a date
 idle = mptc_gym.evaluate(lambda observations: 0.0 * observations[:, :1], "MiddlePointHard-v0")
 assert abs(idle.score) < 1e-9 < idle.least_possible < idle.mean_error, idle
+for controller in DirectNNController(num_envs=5), PIController():
+    scored = mptc_gym.evaluate(controller, episodes=5)
+    assert scored.score > 0.5, scored
 print(f"mptc_gym {installed.version} is complete and runs, with nothing but {needed}")

@@ -1,12 +1,12 @@
 """Controllers for the middle-point temperature of a once-through boiler."""
 
-from agents.controller import Controller
-from agents.dahlin import DahlinController
-from agents.direct_nn import DirectNNController, Weights
-from agents.networks import PolicyNetwork
-from agents.pi import PIController
-from agents.self_tuning import SelfTuningController
-from agents.smith import SmithPredictor
+from .controller import Controller
+from .dahlin import DahlinController
+from .direct_nn import DirectNNController, Weights
+from .networks import PolicyNetwork
+from .pi import PIController
+from .self_tuning import SelfTuningController
+from .smith import SmithPredictor
 
 __all__ = [
     "Controller",

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.actuator import float32_action
+from .actuator import float32_action
 
 # Arguments of the environment for an observation of the latest three set points and the latest
 # three errors: the six inputs of the paper's network.

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.polynomial.polynomial import polysub
 from numpy.typing import NDArray
 
-from agents.controller import Values, integer, not_negative, positive
-from agents.internal_model import InternalModelController
+from .controller import Values, integer, not_negative, positive
+from .internal_model import InternalModelController
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import Controller, from_1, integer, not_negative, number
-from agents.networks import read_arrays, write_arrays
+from .controller import Controller, from_1, integer, not_negative, number
+from .networks import read_arrays, write_arrays
 
 Array = NDArray[np.float64]
 

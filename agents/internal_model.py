@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.actuator import applied_flow, avoid_dead_zone
-from agents.controller import ModelBasedController, Values
+from .actuator import applied_flow, avoid_dead_zone
+from .controller import ModelBasedController, Values
 
 Array = NDArray[np.float64]
 

@@ -16,10 +16,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.actuator import avoid_dead_zone
-from agents.bank import Bank
-from agents.hedge import RandomSetpoint
-from agents.output_filter import OutputFilter
+from .actuator import avoid_dead_zone
+from .bank import Bank
+from .hedge import RandomSetpoint
+from .output_filter import OutputFilter
 
 Array = NDArray[np.floating[Any]]
 

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import Controller, Values, not_negative, positive
+from .controller import Controller, Values, not_negative, positive
 
 Array = NDArray[np.floating[Any]]
 # Layers of a network in the order of computation. Each layer is a pair of weights, shape

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.bank import FAST_POLE, GAIN_LIMITS, GAIN_SPREAD, LIKELIHOOD_FACTOR, NOISE_COLOUR
+from .bank import FAST_POLE, GAIN_LIMITS, GAIN_SPREAD, LIKELIHOOD_FACTOR, NOISE_COLOUR
 
 Array = NDArray[np.floating[Any]]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controller import (
+from .controller import (
     Controller,
     Values,
     integer,

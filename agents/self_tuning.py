@@ -9,10 +9,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.bank import Bank
-from agents.controller import ModelBasedController, integer, not_negative, positive
-from agents.hedge import RandomSetpoint
-from agents.law import Law
+from .bank import Bank
+from .controller import ModelBasedController, integer, not_negative, positive
+from .hedge import RandomSetpoint
+from .law import Law
 
 Array = NDArray[np.floating[Any]]
 

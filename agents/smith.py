@@ -8,9 +8,9 @@ import numpy as np
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
-from agents.controller import Values, integer, positive
-from agents.internal_model import InternalModelController
-from agents.pi import PIController
+from .controller import Values, integer, positive
+from .internal_model import InternalModelController
+from .pi import PIController
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ def packages(code):
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
+        elif isinstance(node, ast.ImportFrom) and not node.level:  # not of the same package
             modules.add(node.module or "")
     return {module.partition(".")[0] for module in modules}
 
