@@ -148,6 +148,15 @@ class TestOwnControllers:
         assert len(members) == 2
         assert errors(members[1], 1, 60) == errors(ROSTER["pi"], 1, 60)
 
+    def test_a_factory_may_return_a_function_and_the_windows_that_it_reads(self, written):
+        policy = "lambda seen: -0.1 * seen[:, 5:6]"
+        windows = {"setpoint_window": 5, "action_window": 20}
+        (member,) = members_of(written(f"def Mine():\n    return ({policy}), {windows}\n"))
+        expected = evaluate(eval(policy), IDS["noisy"], episodes=3, **windows)
+        np.testing.assert_allclose(
+            errors(member, 3, 1200, **PRESETS["noisy"]), expected.errors, rtol=0, atol=1e-12
+        )
+
     @pytest.mark.parametrize("factory", ["ppo", "ppo_normalised"])
     def test_a_model_of_stable_baselines3_enters_by_the_lines_of_the_page(
         self, factory, written, tmp_path, monkeypatch
