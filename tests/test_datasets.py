@@ -70,7 +70,7 @@ HASHES = {
 
 @pytest.mark.parametrize("plant", HASHES)
 def test_a_published_set_is_recorded_again_bit_for_bit(plant):
-    # If one of these changes, so do the figures on the page, and the set needs a new version.
+    # If one of these changes, so does the published list, and the set needs a new version.
     sets = (record(plant, behaviour, episodes=4) for behaviour in ("pi", "smith", "mixed"))
     assert tuple(sha256(plant, episodes)[:16] for episodes in sets) == HASHES[plant]
 

@@ -22,7 +22,11 @@ from tests.conftest import ROOT
 PUBLISHED = ROOT / "benchmarks/published"
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text("utf-8")
-    for path in [ROOT / "README.md", *sorted((ROOT / "benchmarks").rglob("*.md"))]
+    for path in [
+        ROOT / "README.md",
+        ROOT / "mptc_gym/README.md",
+        *sorted((ROOT / "benchmarks").rglob("*.md")),
+    ]
     if PUBLISHED not in path.parents
 }
 MARK = re.compile(r"<!-- numbers: (.*?) -->\n\n?(.*?)(?:\n\n|\Z)", re.DOTALL)
