@@ -31,7 +31,7 @@ PAGES = {
 }
 MARK = re.compile(r"<!-- numbers: (.*?) -->\n\n?(.*?)(?:\n\n|\Z)", re.DOTALL)
 NUMBER = re.compile(r"(?<![\w.,#])(\d[\d,]*(?:\.\d+)?)(?![\w,.]*[\w])( M\b| %| t/h)?")
-INTERVAL = re.compile(r" \([^()]* to [^()]*\)")
+INTERVAL = re.compile(r" \([^()]* to [^()]*\)|(?<=\|) *[\d.,]+ to [\d.,]+ *(?=\|)")  # or a cell
 CELLS = {".md": r"(?<!\\)\|", ".csv": ",", ".txt": " {2,}"}  # what lies between them
 
 
