@@ -83,51 +83,50 @@ def test_pi_by_hand(arguments, errors, commands):
 
 
 BAD_OBSERVATIONS = [np.zeros((1, 3)), np.zeros((1, 1, 6)), np.zeros((2, 6)), [[np.nan] * 6]]
-REFUSED = [  # arguments of an environment, and the message of the error
-    ({"u_max": 12.0}, r"u_max=12\.0, got -10\.0, 10\.0"),
-    ({"setpoint_window": 2}, "newest error as element 3"),
-    ({"error_window": 0}, "newest error as element 3"),
-    ({"action": "change"}, "must have action='flow'"),
-]
 
 
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
-class TestEveryController:
-    def test_bad_observation_changes_nothing(self, make):
-        controller, twin = make(), make()
-        controller.act(np.ones((1, 6))), twin.act(np.ones((1, 6)))
-        for bad in BAD_OBSERVATIONS:
-            with pytest.raises(ValueError, match=r"^observation must"):
-                controller.act(bad)
-            actions = controller.act(np.ones((1, 6))), twin.act(np.ones((1, 6)))
-            assert np.array_equal(*actions)
-
-    def test_plants_that_it_was_not_made_for_are_refused(self, make):
-        controller = make()
-        random_plant = Parameters(dead_zone=[4.0, 5.0], output_window=2)
-        controller.check_environment(random_plant, 1)
-        for arguments, message in REFUSED:
-            with pytest.raises(ValueError, match=message):
-                controller.check_environment(Parameters(**arguments), 1)
+def test_bad_observation_changes_nothing(make):
+    controller, twin = make(), make()
+    controller.act(np.ones((1, 6))), twin.act(np.ones((1, 6)))
+    for bad in BAD_OBSERVATIONS:
+        with pytest.raises(ValueError, match=r"^observation must"):
+            controller.act(bad)
+        actions = controller.act(np.ones((1, 6))), twin.act(np.ones((1, 6)))
+        assert np.array_equal(*actions)
 
 
-def test_some_controllers_refuse_more_plants():
-    errors_alone = Parameters(setpoint_window=0)
-    PIController(error_index=0).check_environment(errors_alone, 5)
-    with pytest.raises(ValueError, match="newest setpoint as element 0"):
-        SelfTuningController(**STEP_TEST, error_index=0).check_environment(errors_alone, 5)
-    with pytest.raises(ValueError, match="num_envs=3, one loop per episode"):
-        DirectNNController(num_envs=2).check_environment(Parameters(), 3)
-    network = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
-    another_dead_zone = network.interface | {"compensated_dead_zone": 7.0}
-    network.check_environment(Parameters(**another_dead_zone), 5)
-    for other, complaint in (
-        ({"output_window": 3}, "arguments with which the policy was trained"),
-        ({"max_move": 0.4}, "arguments with which the policy was trained"),
-        ({"action": "flow"}, "must have action='change'"),
-    ):
-        with pytest.raises(ValueError, match=complaint):
-            network.check_environment(Parameters(**network.interface | other), 5)
+PPO = PolicyNetwork.load(PRETRAINED / "ppo-10000.npz")
+FITTING = [  # for each controller, arguments of an environment and the number of its loops
+    *((make(), {"dead_zone": [4.0, 5.0], "output_window": 2}, 1) for make in MAKERS.values()),
+    (PIController(error_index=0), {"setpoint_window": 0}, 5),
+    (PPO, PPO.interface | {"compensated_dead_zone": 7.0}, 5),
+]
+MISFITS = [  # and the message of the error
+    *((make(), *misfit) for make in MAKERS.values() for misfit in (
+        ({"u_max": 12.0}, 1, r"u_max=12\.0, got -10\.0, 10\.0"),
+        ({"setpoint_window": 2}, 1, "newest error as element 3"),
+        ({"error_window": 0}, 1, "newest error as element 3"),
+        ({"action": "change"}, 1, "must have action='flow'"),
+    )),
+    (SelfTuningController(**STEP_TEST, error_index=0), {"setpoint_window": 0}, 5,
+     "newest setpoint as element 0"),
+    (DirectNNController(num_envs=2), {}, 3, "num_envs=3, one loop per episode"),
+    (PPO, PPO.interface | {"output_window": 3}, 5, "with which the policy was trained"),
+    (PPO, PPO.interface | {"max_move": 0.4}, 5, "with which the policy was trained"),
+    (PPO, PPO.interface | {"action": "flow"}, 5, "must have action='change'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("controller", "arguments", "num_envs"), FITTING)
+def test_a_plant_that_a_controller_was_made_for_is_accepted(controller, arguments, num_envs):
+    controller.check_environment(Parameters(**arguments), num_envs)
+
+
+@pytest.mark.parametrize(("controller", "arguments", "num_envs", "message"), MISFITS)
+def test_another_plant_is_refused(controller, arguments, num_envs, message):
+    with pytest.raises(ValueError, match=message):
+        controller.check_environment(Parameters(**arguments), num_envs)
 
 
 @pytest.mark.parametrize(
@@ -325,7 +324,7 @@ class Harm:
 
 SAVED = {
     "weights": DirectNNController().weights,
-    "policy": PolicyNetwork.load(PRETRAINED / "ppo-10000.npz"),
+    "policy": PPO,
 }
 
 
