@@ -147,19 +147,23 @@ def loaded(model, folder, **arguments):
 # The plain loop
 
 
-def plain_errors(new_act, make=one):
-    """Return the mean error of each episode, degC; `new_act()` gives the law of an episode."""
-    mean_errors = []
+def plain_runs(new_act, make=one):
+    """Return the mean error, degC, and the valve travel, t/h, of each episode, in two columns.
+
+    `new_act()` gives the law of an episode.
+    """
+    results = []
     for seed in range(SEED, SEED + EPISODES):
         with closing(make()) as env:
             act = new_act()
-            errors = []
+            errors, flows = [], [0.0]
             observation, _ = env.reset(seed=seed)
             for _ in range(LENGTH):
                 observation, *_, info = env.step(act(observation))
                 errors.append(abs(info["error"]))
-        mean_errors.append(np.mean(errors))
-    return mean_errors
+                flows.append(info["applied"])
+        results.append((np.mean(errors), np.abs(np.diff(flows)).sum()))
+    return np.transpose(results)
 
 
 def act_of_model(model):
@@ -178,10 +182,12 @@ def act_of_model(model):
 
 
 def assert_as_in_a_plain_loop(evaluation, new_act, make=one):
-    expected = plain_errors(new_act, make)
-    np.testing.assert_allclose(evaluation.errors, expected, rtol=0, atol=1e-6)
-    assert np.ptp(evaluation.errors) > 1e-3
-    assert evaluation.travels.min() > 1.0
+    errors, travels = plain_runs(new_act, make)
+    np.testing.assert_allclose(evaluation.errors, errors, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(evaluation.travels, travels, rtol=0, atol=1e-4)
+    assert evaluation.mean_error == pytest.approx(errors.mean(), abs=1e-6)
+    assert np.ptp(errors) > 1e-3
+    assert travels.min() > 1.0
 
 
 ENVIRONMENTS = {
@@ -289,17 +295,10 @@ def test_frames_are_stacked_in_the_order_of_the_training():
     np.testing.assert_array_equal(evaluation.errors, made.errors)
 
 
-def test_a_model_from_a_file_acts_where_it_is_loaded(tmp_path):
-    model = model_of(trained(VecNormalize(batch(action_window=2))))
-    expected = evaluate(model, NOISY, episodes=EPISODES, **SHORT)
-    model.get_env().save(str(tmp_path / "vecnormalize.pkl"))
-    env = VecNormalize.load(str(tmp_path / "vecnormalize.pkl"), batch(action_window=2))
-    again = evaluate(loaded(model, tmp_path, env=env), NOISY, episodes=EPISODES, **SHORT)
-    np.testing.assert_array_equal(again.errors, expected.errors)
-    # A plain model needs no environments.
-    plain = model_of(one())
-    alone = evaluate(loaded(plain, tmp_path), NOISY, episodes=EPISODES, **SHORT)
-    assert_as_in_a_plain_loop(alone, lambda: act_of_model(plain))
+def test_a_plain_model_from_a_file_needs_no_environments(tmp_path):
+    model = model_of(one())
+    evaluation = evaluate(loaded(model, tmp_path), NOISY, episodes=EPISODES, **SHORT)
+    assert_as_in_a_plain_loop(evaluation, lambda: act_of_model(model))
 
 
 def idle(observations):
