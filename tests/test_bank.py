@@ -75,14 +75,6 @@ def test_gain_and_load_are_those_of_all_samples_at_once(rng, monkeypatch):
 class TestRandomSetpoint:
     SETPOINT = RandomSetpoint(shortest=100.0, longest=300.0, amplitude=5.0)
 
-    def test_the_probability_of_a_level_is_the_share_of_longer_durations(self):
-        durations = np.arange(100, 301)
-        for age, ahead in ((0, 19), (85, 19), (150, 25), (270, 19)):
-            possible = durations[durations > age]
-            share = (possible > age + ahead).mean()
-            held = self.SETPOINT.probability_held(np.array([age]), np.array([ahead]))
-            assert held[0] == pytest.approx(share, abs=1e-12)
-
     def test_no_other_target_has_less_error(self, rng):
         levels = rng.uniform(-5.0, 5.0, 200_000)
         noise = rng.logistic(scale=0.6 / 1.702, size=levels.size)
