@@ -264,12 +264,11 @@ class TestLeastPossible:
                 least_possible(**{"samples": 600, **arguments})
 
 
-class TestHedging:
-    def test_it_gains_where_levels_are_short(self, monkeypatch):
-        short = {"setpoint": "random", "setpoint_period": 120}
-        hedged = mean_error(run_mpc(5, 300, **short)).mean()
-        monkeypatch.setattr(RandomSetpoint, "probability_held", lambda *_: np.ones(1))
-        assert hedged < 0.95 * mean_error(run_mpc(5, 300, **short)).mean()
+def test_it_gains_where_levels_are_short(monkeypatch):
+    short = {"setpoint": "random", "setpoint_period": 120}
+    hedged = mean_error(run_mpc(5, 300, **short)).mean()
+    monkeypatch.setattr(RandomSetpoint, "probability_held", lambda *_: np.ones(1))
+    assert hedged < 0.95 * mean_error(run_mpc(5, 300, **short)).mean()
 
 
 class TestPredictiveController:

@@ -31,15 +31,19 @@ def figures(monkeypatch):
     return figures
 
 
-def test_scores_beyond_the_axis_stand_at_its_ends(figures, tmp_path):
-    values = {"mpc": [1.2, 0.9], "pi": [0.5, -3.0]}
+def plot_scores(values, path):
+    """Draw the scores of controllers, by name, in the cases a and b or in the first alone."""
     rows = [
         {"scenario": case, "agent": agent, "scores": np.array([[score]])}
         for agent, scores in values.items()
-        for case, score in zip(["a", "b"], scores, strict=True)
+        for case, score in zip("ab", scores, strict=False)
     ]
-    scores = {agent: Estimate(*[np.mean(values[agent])] * 3, 2) for agent in values}
-    plots.plot_scores(scores, pd.DataFrame(rows), ROSTER, tmp_path / "scores.png")
+    means = {agent: Estimate(*[np.mean(scores)] * 3, 2) for agent, scores in values.items()}
+    plots.plot_scores(means, pd.DataFrame(rows), ROSTER, path)
+
+
+def test_scores_beyond_the_axis_stand_at_its_ends(figures, tmp_path):
+    plot_scores({"mpc": [1.2, 0.9], "pi": [0.5, -3.0]}, tmp_path / "scores.png")
     (axes,) = figures[0].axes
     labels = axes.xaxis.get_ticklabels()
     assert [labels[i].get_text() for i in (0, -1)] == ["≤ 0", "≥ 0.999"]
@@ -50,12 +54,7 @@ def test_scores_beyond_the_axis_stand_at_its_ends(figures, tmp_path):
 
 
 def test_the_picture_of_scores_says_which_cases_are_missing(figures, tmp_path):
-    rows = [
-        {"scenario": case, "agent": agent, "scores": np.array([[0.5]])}
-        for agent, case in (("mpc", "a"), ("mpc", "b"), ("pi", "a"))
-    ]
-    scores = {agent: Estimate(0.5, 0.5, 0.5, 1) for agent in ("mpc", "pi")}
-    plots.plot_scores(scores, pd.DataFrame(rows), ROSTER, tmp_path / "scores.png")
+    plot_scores({"mpc": [0.5, 0.5], "pi": [0.5]}, tmp_path / "scores.png")
     labels = [label.get_text() for label in figures[0].axes[0].get_yticklabels()]
     assert labels == ["MPC", "PI (1992)\n(1 of 2 cases)"]
 
@@ -73,19 +72,18 @@ def responses(agent, outputs, spread=0.0):
     )  # fmt: skip
 
 
-class TestResponses:
-    def test_the_first_run_is_shown_in_whole_and_as_a_temperature(self, figures, tmp_path):
-        rows = pd.concat([responses("pi", [3.0, 7.0]), responses("smith", [5.0])])
-        errors = pd.Series({"pi": 2.0, "smith": 1.0})
-        case = SCENARIOS["constant"]
-        plots.plot_responses(rows, errors, case, ROSTER, tmp_path / "constant.png")
-        smith, _, pi, flow = figures[0].axes
-        assert smith.get_title(loc="left") == "Smith: mean error 1.000 °C"
-        colour, _ = ROSTER["pi"].look
-        (run,) = [line for line in pi.get_lines() if line.get_color() == colour]
-        np.testing.assert_array_equal(run.get_ydata()[-2:], [3.0, 7.0])
-        low, high = pi.get_ylim()
-        assert low < 3.0 < 7.0 < high
-        assert flow.get_xlim() == (0.0, pytest.approx(599 * 8 / 60))
-        finding = "PI (1992) has 2.0 times the mean error of Smith"
-        assert figures[0].get_suptitle().endswith(finding)
+def test_the_first_run_is_shown_in_whole_and_as_a_temperature(figures, tmp_path):
+    rows = pd.concat([responses("pi", [3.0, 7.0]), responses("smith", [5.0])])
+    errors = pd.Series({"pi": 2.0, "smith": 1.0})
+    case = SCENARIOS["constant"]
+    plots.plot_responses(rows, errors, case, ROSTER, tmp_path / "constant.png")
+    smith, _, pi, flow = figures[0].axes
+    assert smith.get_title(loc="left") == "Smith: mean error 1.000 °C"
+    colour, _ = ROSTER["pi"].look
+    (run,) = [line for line in pi.get_lines() if line.get_color() == colour]
+    np.testing.assert_array_equal(run.get_ydata()[-2:], [3.0, 7.0])
+    low, high = pi.get_ylim()
+    assert low < 3.0 < 7.0 < high
+    assert flow.get_xlim() == (0.0, pytest.approx(599 * 8 / 60))
+    finding = "PI (1992) has 2.0 times the mean error of Smith"
+    assert figures[0].get_suptitle().endswith(finding)
