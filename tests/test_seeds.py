@@ -5,8 +5,6 @@ import json
 
 import pytest
 
-from agents import PolicyNetwork
-from agents.networks import PRETRAINED
 from benchmarks import datasets, tune
 from benchmarks.claims.runs import Batch
 from benchmarks.controllers import roster
@@ -56,10 +54,3 @@ def test_published_files_have_the_seeds_of_the_table():
     assert {block_of(seed) for seed in seeds} == {"published"}
     bounds = read("mptc_gym/bounds.json")
     assert block_of(bounds["seed"] + bounds["episodes"] - 1) == "published"
-
-
-@pytest.mark.parametrize("controller", ["ppo", "ppo-hard"])
-def test_trained_networks_have_the_seeds_of_the_table(controller):
-    for file in roster.ROSTER[controller].trainings:
-        provenance = PolicyNetwork.load(PRETRAINED / file).provenance
-        assert block_of(provenance["seed"]) == "networks"

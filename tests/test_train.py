@@ -157,10 +157,11 @@ def test_those_of_the_project_are_of_the_recipes_and_the_search_is_that_of_its_l
     recipe = ppo.RECIPES[name]
     settings = json.loads(json.dumps(asdict(recipe)))
     assert settings.pop("plant") == {}
-    files = [f"{name}-{seed}.npz" for seed in range(10_000, 10_005)]
-    assert ROSTER[name].trainings == files
-    for file in files:
+    files = {seed: f"{name}-{seed}.npz" for seed in range(program.SEED, program.SEED + 5)}
+    assert ROSTER[name].trainings == [*files.values()]
+    for seed, file in files.items():
         network = PolicyNetwork.load(PRETRAINED / file)
+        assert network.provenance["seed"] == seed
         assert settings.items() <= network.provenance["recipe"].items()
         count = sum(W.size for W, _ in network.layers)
         assert f"{count:,} weights" in ROSTER[name].searched
