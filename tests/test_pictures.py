@@ -85,5 +85,7 @@ def test_the_first_run_is_shown_in_whole_and_as_a_temperature(figures, tmp_path)
     low, high = pi.get_ylim()
     assert low < 3.0 < 7.0 < high
     assert flow.get_xlim() == (0.0, pytest.approx(599 * 8 / 60))
+    assert flow.get_xlabel() == "time (min)"
+    assert flow.get_lines()[-1].get_xdata()[-1] == pytest.approx(599 * 8 / 60)
     finding = "PI (1992) has 2.0 times the mean error of Smith"
     assert figures[0].get_suptitle().endswith(finding)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.lib import statistics
-from benchmarks.lib.statistics import bootstrap, quantile, share
+from benchmarks.lib.statistics import bootstrap, percentiles, quantile, share
 from tests.conftest import assert_the_seed_is_all_that_differs
 
 SOME_NEVER_END = np.r_[np.arange(1.0, 91.0), [math.inf] * 10]
@@ -32,6 +32,10 @@ def test_quantiles_by_hand(values, level, expected):
     estimate = quantile(values, level)
     assert (estimate.value, estimate.low, estimate.high) == expected
     assert estimate.runs == len(values)
+
+
+def test_what_never_ends_in_any_run_never_ends_in_the_median():
+    assert {*percentiles(np.full(3, math.inf)).values()} == {math.inf}
 
 
 def test_the_interval_of_two_values_is_wide():
