@@ -37,14 +37,6 @@ def test_flows_by_hand(arguments, actions, flows):
     assert [info["applied"] for info in infos] == pytest.approx(flows, abs=5e-5)
 
 
-def test_past_actions_are_those_that_command_the_flow():
-    env = make(action_window=2, max_move=0.4)
-    env.reset()
-    env.step(np.ones(1, np.float32))
-    observation, *_ = env.step(np.ones(1, np.float32))
-    assert observation[-2:] == pytest.approx([0.8, 0.4])
-
-
 def test_a_past_action_commands_the_same_flow_in_the_other_form():
     env = make(action_window=1, compensated_dead_zone=5.0)
     flow = gymnasium.make("MiddlePoint-v0")

@@ -223,19 +223,22 @@ class TestDirectNN:
         assert np.isfinite(batch.act([[-1e3] * 6, [1e3] * 6])).all()
 
 
-def test_simc_by_hand():
-    # Kc = tau / (|k| (tau_c + theta)) = 100 / (2 x 50) = 1; tau_I = min(100, 4 x 50) = 100.
-    plant = {"gain": -2.0, "time_constant": 100.0}
-    controller = PIController.simc(
-        **plant, delay=20.0, closed_loop_time_constant=30.0, sampling_interval=5.0
-    )
-    assert (controller.kp, controller.ki) == pytest.approx((1.0, 1.0 * 5 / 100))
+@pytest.mark.parametrize(
+    ("arguments", "kp", "ki"),
+    [
+        # Kc = tau / (|k| (tau_c + theta)) = 100 / (2 x 50); tau_I = min(100, 4 x 50) = 100.
+        (
+            {"delay": 20.0, "closed_loop_time_constant": 30.0, "sampling_interval": 5.0},
+            1.0, 1.0 * 5 / 100,
+        ),
+        # By default tau_c = theta: 100 / (2 x 20) = 2.5; tau_I = 4 x 20, less than 100.
+        ({"delay": 10.0}, 2.5, 2.5 * 8 / 80),
+    ],
+)  # fmt: skip
+def test_simc_by_hand(arguments, kp, ki):
+    controller = PIController.simc(gain=-2.0, time_constant=100.0, **arguments)
+    assert (controller.kp, controller.ki) == pytest.approx((kp, ki))
     assert controller.anti_windup
-    # By default tau_c = theta: 100 / (2 x 20) = 2.5; tau_I = 4 x 20, less than 100.
-    controller = PIController.simc(**plant, delay=10.0)
-    assert (controller.kp, controller.ki) == pytest.approx((2.5, 2.5 * 8 / 80))
-    with pytest.raises(ValueError, match="must be given if delay is 0"):
-        PIController.simc(**plant, delay=0.0)
 
 
 @pytest.mark.parametrize(
@@ -354,7 +357,7 @@ BAD = {
         ("direction", 0.5), ("num_envs", True), ("update_interval", 0),
     ],
     partial(PIController.simc, **STEP_TEST): [
-        ("gain", 0.0), ("time_constant", 0.0), ("delay", -1.0), ("u_min", 10.0),
+        ("gain", 0.0), ("time_constant", 0.0), ("delay", -1.0), ("delay", 0.0), ("u_min", 10.0),
         ("closed_loop_time_constant", 0.0), ("sampling_interval", 0.0), ("u_min", -np.inf),
     ],
     partial(DahlinController, **TUNED): [
