@@ -72,22 +72,18 @@ def test_gain_and_load_are_those_of_all_samples_at_once(rng, monkeypatch):
     assert kalman.load[0] == pytest.approx(load, abs=1e-9)
 
 
-class TestRandomSetpoint:
-    SETPOINT = RandomSetpoint(shortest=100.0, longest=300.0, amplitude=5.0)
-
-    def test_no_other_target_has_less_error(self, rng):
-        levels = rng.uniform(-5.0, 5.0, 200_000)
-        noise = rng.logistic(scale=0.6 / 1.702, size=levels.size)
-        for setpoint, held in ((4.0, 0.9), (4.0, 0.55), (-3.0, 0.7)):
-            stays = rng.random(levels.size) < held
-            wanted = np.where(stays, setpoint, levels)
-            candidates = np.linspace(min(setpoint, 0.0), max(setpoint, 0.0), 81)
-            losses = [np.abs(wanted - target - noise).mean() for target in candidates]
-            best = candidates[np.argmin(losses)]
-            target = self.SETPOINT.targets(
-                np.array([setpoint]), np.array([held]), np.array([0.6])
-            )
-            assert target[0] == pytest.approx(best, abs=0.12)
+def test_no_other_target_has_less_error(rng):
+    hedge = RandomSetpoint(shortest=100.0, longest=300.0, amplitude=5.0)
+    levels = rng.uniform(-5.0, 5.0, 200_000)
+    noise = rng.logistic(scale=0.6 / 1.702, size=levels.size)
+    for setpoint, held in ((4.0, 0.9), (4.0, 0.55), (-3.0, 0.7)):
+        stays = rng.random(levels.size) < held
+        wanted = np.where(stays, setpoint, levels)
+        candidates = np.linspace(min(setpoint, 0.0), max(setpoint, 0.0), 81)
+        losses = [np.abs(wanted - target - noise).mean() for target in candidates]
+        best = candidates[np.argmin(losses)]
+        target = hedge.targets(np.array([setpoint]), np.array([held]), np.array([0.6]))
+        assert target[0] == pytest.approx(best, abs=0.12)
 
 
 @pytest.mark.parametrize("dead_zone", [5.0, 7.0])
