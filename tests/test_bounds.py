@@ -272,8 +272,15 @@ def test_it_gains_where_levels_are_short(monkeypatch):
 
 
 class TestPredictiveController:
-    def test_it_expects_the_load_to_stay(self):
-        load = SCENARIOS["load"].arguments
+    @pytest.mark.parametrize(
+        "load",
+        [
+            SCENARIOS["load"].arguments,  # jumps
+            # A walk that the flow can make up for within its limits.
+            {"setpoint": 0.0, "dead_zone": 0.0, "disturbance_walk_variance": 0.005},
+        ],
+    )
+    def test_it_expects_the_load_to_stay(self, load):
         least = least_possible(samples=600, **load).value
         assert least < errors(CONTROLLERS["mpc"], 20, 600, **load).mean() < 1.1 * least
 
