@@ -18,7 +18,7 @@ from benchmarks.bounds.least import least_possible
 from benchmarks.compare import plots, runs
 from benchmarks.compare.__main__ import main
 from benchmarks.compare.estimates import estimate, ranked
-from benchmarks.compare.runs import least_error, run_case
+from benchmarks.compare.runs import bound_of, run_case
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop.measures import make_plants, mean_error, measure, rollout
@@ -88,7 +88,7 @@ def some_runs(**errors):
 
 class TestEstimates:
     def test_by_hand(self):
-        bound = least_error(SCENARIOS["constant"], 3, SEED)
+        bound = bound_of(SCENARIOS["constant"], 3, SEED)
         least = bound.least
         rows = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
         rows = rows.assign(scenario="constant")
@@ -103,7 +103,7 @@ class TestEstimates:
         assert nn["mean"].low < nn["mean"].value < nn["mean"].high
 
     def test_a_score_by_hand_and_the_best_comes_first(self):
-        bounds = [least_error(SCENARIOS[name], 1, SEED) for name in ("constant", "square")]
+        bounds = [bound_of(SCENARIOS[name], 1, SEED) for name in ("constant", "square")]
         rows = []
         for scenario, least in bounds:
             half = (least.value + least.idle.value) / 2
@@ -272,9 +272,9 @@ class TestCompare:
     def test_the_screen_has_one_narrow_table(
         self, cases, headings, compared, capsys, monkeypatch
     ):
-        constant = least_error(SCENARIOS["constant"], 1, SEED)
+        constant = bound_of(SCENARIOS["constant"], 1, SEED)
         monkeypatch.setattr(
-            runs, "least_error", lambda scenario, *_: constant._replace(scenario=scenario)
+            runs, "bound_of", lambda scenario, *_: constant._replace(scenario=scenario)
         )
         long = f"{30 * 'x'}=agents:PIController"
         compared(f"{cases} --agents pi-searched idle --runs 1 --agent {long}")

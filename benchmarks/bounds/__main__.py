@@ -81,7 +81,7 @@ class Options:
 def work(options: Options) -> None:
     """Print a table of least possible mean errors, below an explanation of the columns.
 
-    If an error or an interruption ends the computation, the printed table has only the cases
+    If tasks fail or the user interrupts the computation, the printed table has only the cases
     that are finished. With the option `--package`, write the file `mptc_gym/bounds.json`
     instead.
     """
@@ -89,18 +89,18 @@ def work(options: Options) -> None:
 
     from benchmarks.lib.report import Section, show
 
-    cases = options.plant.cases(SCENARIOS | PRESET_SCENARIOS)
     if options.package:
         write_package(options.fan_out)
         return
+    cases = options.plant.cases(SCENARIOS | PRESET_SCENARIOS)
     tasks = {name: partial(row, case, options.mpc) for name, case in cases.items()}
     title = "Mean absolute error in °C"
     if options.plant.name:
         title += f", plant: {options.plant.name}"
     finished = options.fan_out.run(tasks, "bounds")
-    columns = [f'- "{heading}": {meaning}' for heading, meaning in COLUMNS.items()]
+    explanations = [f'- "{heading}": {meaning}' for heading, meaning in COLUMNS.items()]
     table = pd.DataFrame(list(finished.results.values()))
-    show(Section(f"{title}:", [INTERVALS, *columns], table))
+    show(Section(f"{title}:", [INTERVALS, *explanations], table))
     if finished.error:
         raise finished.error
 

@@ -71,7 +71,7 @@ class SetPointLaw:
     """
 
     def __init__(self, model: LinearModel, bounds: ErrorBounds) -> None:
-        samples = len(model.load_factor)
+        samples = len(model.load_factor)  # one factor for each sample
         parameters = model.parameters
         at_start = LinearModel(parameters, model.numbers, 0)
         self._flow_response = response(*equations(model, samples))
@@ -87,6 +87,7 @@ class SetPointLaw:
         self._reachable = gain * min(-low, high)
         # Noise makes the sign of a small error uncertain. Equally probable magnitudes of the
         # noise, degC, are quantiles of the magnitude of a normal random number.
+        # The mean magnitude of a normal number is sqrt(2 / pi) standard deviations.
         deviation = bounds.intercepts[-1, 0] / np.sqrt(2.0 / np.pi)
         shares = (np.arange(NOISE_MAGNITUDES) + 0.5) / NOISE_MAGNITUDES
         self._noise_magnitudes = np.zeros(1)
@@ -98,13 +99,14 @@ class SetPointLaw:
         age = np.arange(samples)
         self._progress = 1.0 - at_start.slowest_pole ** np.maximum(age - model.lag + 1, 0)
         # Age of a level at which the output counts as having arrived at the level, after every
-        # change of the set point. The largest change is from -amplitude to amplitude.
+        # change of the set point. The largest change is from -amplitude to amplitude, on the
+        # way from -amplitude to `_reachable`.
         largest_way = max(self._reachable + self._amplitude, SMALLEST_RANGE)
         largest_share = 2.0 * self._amplitude / largest_way
         self._arrival_age = int(np.searchsorted(self._progress, min(largest_share, ARRIVED)))
         # Probability that a level of the set point lasts longer than an age, by age.
-        lengths = self._longest - self._shortest + 1
-        self._probability_held = np.clip((self._longest - age) / lengths, 0.0, 1.0)
+        length_count = self._longest - self._shortest + 1
+        self._probability_held = np.clip((self._longest - age) / length_count, 0.0, 1.0)
         # The output's response to a flow of 1 t/h at one sample, degC. Element 0 is the first
         # output that the flow can affect.
         zeros = model.lag - int(model.numbers.delay) - 1  # leading zeros of B
@@ -226,10 +228,12 @@ class SetPointLaw:
         for age in range(min(self._longest, samples) - 1, self._arrival_age - 1, -1):
             known_age = age - self._lag  # the age when the flow is chosen
             ages = np.arange(age, min(samples, age + HORIZON))
+            # The sum without the slope at this age, which is still 0 in `slope`.
             expected = self._expected_slope(ages, known_age, slope, change_sums)
-            effect_of_flow = self._impulse[: len(ages)] @ expected
+            known_sum = self._impulse[: len(ages)] @ expected
+            # The probability that the level is held at this age, as in `_expected_slope`.
             count = self._longest - max(self._shortest, known_age + 1) + 1
             held_probability = min(1.0, (self._longest - age) / count)
-            solution = -effect_of_flow / (self._impulse[0] * held_probability)
+            solution = -known_sum / (self._impulse[0] * held_probability)
             slope[age] = np.clip(solution, -1.0, 1.0)
         return slope

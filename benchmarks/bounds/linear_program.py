@@ -173,14 +173,14 @@ def plan(
     flow[:past_count] = past
     A, B = equations(model, samples)
     if past_count < samples - 1:
-        error_of_past = setpoint - scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
+        error_without_plan = setpoint - scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
         price = np.broadcast_to(np.asarray(penalty, float), samples)
-        program = _program(model, bounds, error_of_past, flow[:past_count], quiet, price)
+        program = _program(model, bounds, error_without_plan, flow[:past_count], quiet, price)
         chosen = samples - 1 - past_count  # number of flows
-        # The variables of the program are the outputs, the flows and others.
+        # The variables of the program are `chosen` outputs, `chosen` flows, and others.
         flow[past_count:-1] = _solve(program)[chosen : 2 * chosen]
     if samples > 1:
-        flow[-1] = flow[-2]  # The last flow affects no output, so the valve need not move.
+        flow[-1] = flow[-2]  # The last flow affects no output, even without delay.
     output = scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
     return Plan(bounds.mean_error(setpoint - output), flow)
 
@@ -188,7 +188,7 @@ def plan(
 def _program(
     model: LinearModel,
     bounds: ErrorBounds,
-    error_of_past: Array,
+    error_without_plan: Array,
     past: Array,
     quiet: bool,
     price: Array,
@@ -213,14 +213,14 @@ def _program(
     ----------
     model, bounds, quiet
         Arguments of `plan`.
-    error_of_past
+    error_without_plan
         Expected errors if all flows after the past flows are 0, degC, shape (samples,).
     past
         Past flows, which are fixed, t/h, shape (count,).
     price
         Price of each flow, degC per t/h, shape (samples,).
     """
-    samples = len(error_of_past)
+    samples = len(error_without_plan)
     count = len(past)
     first = count + 1  # sample of the first output after the past flows
     n = samples - first
@@ -233,7 +233,7 @@ def _program(
         slopes = np.maximum(slopes, SMALLEST_SLOPE)
     signs = scipy.sparse.hstack([eye, -eye] * len(slopes))
     blocks = [[A[first:, first:], -B[first:, count:-1], None], [eye, None, signs]]
-    right = [np.zeros(n), error_of_past[first:]]
+    right = [np.zeros(n), error_without_plan[first:]]
     # For each slope, n lengths for the positive pieces, and the same for the negative pieces.
     lengths = np.repeat(bounds.lengths[first:samples], 2, axis=1).T.ravel()
     costs = [np.zeros(n), price[count:-1], np.repeat(slopes, 2 * n)]

@@ -218,15 +218,16 @@ def _effects_on_output(
     parts = [noise]
     probabilities: list[Array] = [no_jump_probability ** changes.counts.astype(np.float64)]
     effects_of_level = [np.zeros_like(noise.values)]
-    coarse_noise = reduced(noise, JUMP_ATOMS)
+    coarse_noise = reduced(noise, JUMP_ATOMS)  # `sum_of` would take long with all atoms
     after_jumps = _after_jumps(changes.effects, amplitude, jump_probability)
     for place, after_jump in enumerate(after_jumps):
         part = sum_of(coarse_noise, after_jump, JUMP_ATOMS)
-        changes_before = changes.counts - 1 - place
-        probability = jump_probability * no_jump_probability ** np.maximum(changes_before, 0)
+        # Column 0 belongs to the latest change, so the columns after `place` are earlier ones.
+        earlier_changes = changes.counts - 1 - place
+        probability = jump_probability * no_jump_probability ** np.maximum(earlier_changes, 0)
         effect = -changes.effects[:, place, np.newaxis]  # The first jump ends the level l.
         parts.append(part)
-        probabilities.append(np.where(changes_before >= 0, probability, 0.0))
+        probabilities.append(np.where(earlier_changes >= 0, probability, 0.0))
         effects_of_level.append(np.broadcast_to(effect, part.values.shape))
     return mixture(parts, probabilities), np.hstack(effects_of_level)
 

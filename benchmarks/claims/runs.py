@@ -133,6 +133,7 @@ def converged_at(weights: Array) -> Array:
     # In reversed time, the index of the first sample outside is the number of converged
     # samples.
     converged_samples = np.argmax(is_outside[::-1], axis=0)
+    # 0 for weights that never changed.
     first_converged = np.where(is_outside.any(axis=0), samples - converged_samples, 0)
     is_long_enough = first_converged <= samples - CONVERGED_SAMPLES
     return np.where(is_long_enough, first_converged, np.inf)

@@ -33,7 +33,8 @@ from mptc_gym.evaluation import SEED
 _SCENARIOS_HELP = (
     f"The cases to run (default: all). The cases are {', '.join(SCENARIOS)}. With "
     f"--presets, the cases are {', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set, "
-    f"the cases are {', '.join(setpoint.name for setpoint in SETPOINTS)}."
+    f"the cases are {', '.join(setpoint.name for setpoint in SETPOINTS)}; or run, with the set "
+    f"point of the plant's arguments, if these have one."
 )
 
 
@@ -64,14 +65,14 @@ class Options:
 def work(options: Options) -> None:
     """Compare controllers, write the results, and print a table and the path of the report.
 
-    If a task fails or the user interrupts the comparison, the results of all finished tasks are
-    written before an error is raised.
+    If a task fails or the user interrupts the comparison, the results of the controllers that
+    have finished are written before an error is raised.
     """
     from benchmarks.compare.report import write
-    from benchmarks.compare.runs import Bound, Result, least_error, run_case
+    from benchmarks.compare.runs import Bound, Result, bound_of, run_case
 
     chosen = choose("--agents", options.agents, ROSTER) | own_controllers(options.agent)
-    controllers, note = that_fit(chosen, options.plant)
+    controllers, note = fitting_the_gain(chosen, options.plant)
     folder_name, scenarios = cases(options)
     runs, seed = options.runs, options.seed
     provenance = provenance_of(
@@ -82,7 +83,7 @@ def work(options: Options) -> None:
     folder = new_folder(options.out, folder_name, provenance)
     tasks: dict[str, Any] = {}
     for case, scenario in scenarios.items():
-        tasks[f"bounds of {case}"] = partial(least_error, scenario, runs, seed)
+        tasks[f"bounds of {case}"] = partial(bound_of, scenario, runs, seed)
     for name, controller in controllers.items():
         for case, scenario in scenarios.items():
             tasks[f"{name}, {case}"] = partial(run_case, scenario, controller, runs, seed)
@@ -91,8 +92,7 @@ def work(options: Options) -> None:
     bounds = [outcome for outcome in outcomes if isinstance(outcome, Bound)]
     results = [outcome for outcome in outcomes if isinstance(outcome, Result)]
     if results:
-        table = write(results, bounds, controllers, folder, provenance, note, finished.error)
-        print(f"{table}\nThe report, tables, data and pictures are in {folder}/")
+        print(write(results, bounds, controllers, folder, provenance, note, finished.error))
     if finished.error:
         raise finished.error
 
@@ -115,7 +115,7 @@ def cases(options: Options) -> tuple[str, dict[str, Scenario]]:
     return folder_name, choose("--scenarios", names, available)
 
 
-def that_fit(
+def fitting_the_gain(
     controllers: Mapping[str, ControllerSpec], plant: PlantOptions
 ) -> tuple[dict[str, ControllerSpec], str]:
     """Return the controllers that fit the sign of the plant's gain, and a sentence on others.

@@ -71,7 +71,7 @@ class Comparison:
     results : sequence of Result
         Results of each controller in each scenario, from all tasks that have finished.
     runs : pandas.DataFrame
-        Table with a row for each run of `results`.
+        Table with a row for each run in the scenarios of `bounds`.
     estimates : pandas.DataFrame
         Table with a row for each scenario and controller, from `estimates.estimate`.
     scores : mapping
@@ -95,12 +95,13 @@ def write(
     note: str,
     error: CommandError | None,
 ) -> str:
-    """Write the CSV files, pictures and report of a comparison, and return a table for screens.
+    """Write the CSV files, pictures and report of a comparison, and return text for the screen.
 
     A scenario that is not in `bounds` is written to the CSV files, but not to the report.
     `controllers` has the record of each controller by name, `provenance` is the provenance of
     the results, as `provenance_of` returns it, `note` is a sentence on controllers that are
-    left out, and `error` says which results are missing.
+    left out, or "", and `error` says which results are missing. The returned text has the
+    scores and error ratios, `note`, and the path of the files.
     """
     tables = [pd.DataFrame(columns) for result in results for columns in result.runs]
     runs = pd.concat(tables, ignore_index=True)
@@ -113,18 +114,20 @@ def write(
         responses[name].to_csv(folder / f"{name}.csv", index=False)
     # The report has the scenarios with both results and least possible errors.
     bounds = [bound for bound in bounds if bound.scenario.name in responses]
-    runs = runs[runs["scenario"].isin([bound.scenario.name for bound in bounds])]
-    if runs.empty:
-        return note
-    estimates = estimate(runs, bounds)
+    if not bounds:
+        return f"{note}\nNo report without a least possible error; data in {folder}/".strip()
+    reported_runs = runs[runs["scenario"].isin([bound.scenario.name for bound in bounds])]
+    estimates = estimate(reported_runs, bounds)
+    # Arrays do not fit into the cells of a CSV file.
     write_numbers(folder / "estimates.csv", estimates.drop(columns="scores"))
     scores = ranked(estimates)
-    comparison = Comparison(controllers, bounds, results, runs, estimates, scores)
+    comparison = Comparison(controllers, bounds, results, reported_runs, estimates, scores)
     plots.plot_scores(scores, estimates, controllers, folder / "scores.png")
     for scenario, _ in bounds:
         rows = responses[scenario.name]
         rows = rows[rows["agent"].isin(pictured(rows["agent"].unique()))]
-        errors = runs[runs["scenario"] == scenario.name].groupby("agent")["mae"].mean()
+        case_runs = reported_runs[reported_runs["scenario"] == scenario.name]
+        errors = case_runs.groupby("agent")["mae"].mean()
         path = folder / f"{scenario.name}.png"
         plots.plot_responses(rows, errors, scenario, controllers, path)
     finished_cases = estimates["agent"].value_counts()
@@ -134,7 +137,8 @@ def write(
         note = f"{note} {missing}".strip()
     page = sections(comparison, note)
     write_report(folder, "Comparison of controllers", page, provenance, error)
-    return "\n".join(filter(None, [on_screen(comparison), note]))
+    path_text = f"The report, tables, data and pictures are in {folder}/"
+    return "\n".join(filter(None, [on_screen(comparison), note, path_text]))
 
 
 def pictured(agents: Iterable[str]) -> list[str]:

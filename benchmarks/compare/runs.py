@@ -48,7 +48,7 @@ class Result:
         Maximum sensitivity Ms of the loop with the nominal plant, infinite for an unstable
         loop; None if the controller is not linear.
     seconds : float
-        Processor time of the runs, s.
+        Processor time of making and running the controller, s.
     """
 
     scenario: str
@@ -68,8 +68,8 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     `runs` is the number of runs of each member, and run i has the seed `seed + i`.
     """
     start = time.process_time()
-    are_equal = not (controller.random or is_random(scenario.parameters))
-    simulated_runs = 1 if are_equal else runs
+    runs_are_equal = not (controller.random or is_random(scenario.parameters))
+    simulated_runs = 1 if runs_are_equal else runs
     members = [  # pairs of a controller and the arguments of its environment
         member.start(scenario.arguments, simulated_runs, seed)
         for member in controller.members()
@@ -93,7 +93,7 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
         for name, values in measure(trajectory, scenario.parameters).items():
             columns[name] = np.broadcast_to(values, runs)  # The values may be of a single run.
         tables.append(columns)
-    first_agent, _ = members[0]
+    first_agent, _ = members[0]  # Ms is that of the first member.
     sensitivity = None
     if isinstance(first_agent, LinearController):
         loop = LinearLoop.of(first_agent, nominal(scenario.parameters))
@@ -147,7 +147,7 @@ class Bound(NamedTuple):
     least: LeastPossible
 
 
-def least_error(scenario: Scenario, runs: int, seed: int) -> Bound:
+def bound_of(scenario: Scenario, runs: int, seed: int) -> Bound:
     """Return the least possible error in a scenario, a mean over episodes.
 
     As least possible errors take long to compute, the mean is over the first `runs` episodes,

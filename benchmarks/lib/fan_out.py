@@ -101,7 +101,7 @@ class FanOut:
         return Finished(results, error)
 
     def _outcomes(self, tasks: Mapping[str, Task]) -> Iterable[Outcome]:
-        """Run tasks, and return an `Outcome` for each task, in the order in which they end."""
+        """Run tasks, and return an `Outcome` for each task, on this machine as it ends."""
         import joblib  # imported here, as it is slow to import
 
         calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]

@@ -159,20 +159,21 @@ class PlantOptions:
         arguments = self.arguments()
         if not self.name:
             return default
-        setpoints: tuple[Scenario, ...] = SETPOINTS
+        cases: tuple[Scenario, ...] = SETPOINTS
         if {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments):
-            setpoints = (Scenario("run", "the set point of the plant's arguments", 1200, {}),)
-        cases = {}
-        for setpoint in setpoints:
-            title = f"{setpoint.title}, {self.name}"
-            combined = {**arguments, **setpoint.arguments}
-            cases[setpoint.name] = replace(setpoint, title=title, arguments=combined)
-        return cases
+            cases = (Scenario("run", "the set point of the plant's arguments", 1200, {}),)
+        cases_by_name = {}
+        for case in cases:
+            title = f"{case.title}, {self.name}"
+            combined = {**arguments, **case.arguments}
+            cases_by_name[case.name] = replace(case, title=title, arguments=combined)
+        return cases_by_name
 
     def arguments(self) -> Arguments:
         """Return the arguments of the environment that --preset, --plant and --set choose.
 
-        A `CommandError` is raised if an argument is unknown or invalid.
+        A `CommandError` is raised if an argument is unknown or invalid, or if the file cannot
+        be read.
         """
         arguments: Arguments = {}
         if self.preset:
