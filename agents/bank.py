@@ -3,7 +3,8 @@
 All quantities are dimensionless, so that a bank of candidate models suits any plant. Flows are
 divided by half the flow range, (u_max - u_min) / 2. Temperatures are divided by the steady
 temperature change that half the flow range causes according to the step test. Times are divided
-by the sampling interval. A positive dimensionless flow raises the temperature.
+by the interval between two changes of the command. A positive dimensionless flow raises the
+temperature.
 
 The last axis of every array is the plant. For n plants, an array has for example the shape
 (n,), (time constants, n) or (delays, time constants, n). All plants have the same candidate
@@ -55,7 +56,8 @@ LARGEST_SQUARE: Final = 16.0
 # Prior standard deviation of the gain, divided by the gain that the step test measured.
 GAIN_SPREAD: Final = 0.25
 GAIN_LIMITS: Final = (0.3, 3.0)  # least and greatest gain, as multiples of the step test's
-# Least value of ln(p / q), for a model's probability p and the greatest probability q.
+# Least value of ln(p / q), for a model's probability p and the greatest probability q. Such a
+# model no longer matters, and much lower values would make exp slow (subnormal numbers).
 LEAST_LOGARITHM: Final = -30.0
 # Samples between updates of the models' gains and probabilities. These updates take the most
 # computing time.
@@ -276,7 +278,8 @@ class Bank:
 
     def _renew_estimates(self) -> None:
         """Update the gains and probabilities of the models, and the means over the models."""
-        # Recursive least squares: of_prior is the weight of the gain's prior mean, which is 1.
+        # Least squares, with the sums that `_learn` updates: of_prior is the weight of the
+        # gain's prior mean, which is 1.
         of_prior = self.variance / GAIN_SPREAD**2
         gains = (self._products + of_prior) / (self._information + of_prior)
         self._gains = np.clip(gains, *GAIN_LIMITS)

@@ -187,9 +187,9 @@ class Controller(ABC):
         Raises
         ------
         ValueError
-            If `observation` has a wrong shape, a value that is not finite, or another batch
-            size than earlier observations since `reset`. A ValueError leaves the controller
-            unchanged.
+            If `observation` has a wrong shape, a value that is not finite, or, for a controller
+            that remembers past samples, another batch size than earlier observations since
+            `reset`. A ValueError leaves the controller unchanged.
         """
         values = np.asarray(observation, np.float64)
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs or not len(values):
@@ -203,7 +203,7 @@ class Controller(ABC):
         if self._loop_shape not in (None, loop_shape):
             raise ValueError(
                 f"observation must have shape {(*self._loop_shape, self.n_obs)}, as the "
-                f"number of loops is fixed by num_envs or since reset, got {values.shape}"
+                f"number of loops must not change before a reset, got {values.shape}"
             )
         commands = self._control(np.atleast_2d(values))
         is_batch = loop_shape != ()

@@ -5,8 +5,8 @@ the output. Kalman filters forecast the part of the output that the models do no
 next flow moves the predicted output towards a target.
 
 Quantities are dimensionless as in `agents.bank`: flows are divided by half the flow range,
-temperatures by the steady temperature change for half the flow range, and times by the sampling
-interval.
+temperatures by the steady temperature change for half the flow range, and times by the interval
+between two changes of the command.
 """
 
 from __future__ import annotations

@@ -148,7 +148,7 @@ class PolicyNetwork(Controller):
             If the file is damaged or of another version of this project, or if a flow limit is
             out of range.
         KeyError
-            If the file contains other arrays than those of a policy network.
+            If the file lacks an array of a policy network.
         OSError
             If the file cannot be opened.
         """

@@ -88,7 +88,7 @@ class PIController(Controller):
             theta, the plant's delay, s.
         closed_loop_time_constant
             tau_c, the wanted time constant of the closed loop, s; None for a tau_c equal to
-            `delay`, as Skogestad recommends for "tight control with good robustness".
+            `delay`, as Skogestad recommends for fast control that is still robust.
         sampling_interval
             Sampling interval, s.
         **arguments

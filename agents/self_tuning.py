@@ -28,8 +28,8 @@ CONSTANT_SPREAD: Final = 0.3
 # Distance of the smallest flow from the dead zone, as a share of half the flow range. This
 # distance keeps a flow out of the dead zone after rounding to float32.
 CLEARANCE: Final = 1e-4
-# Longest time constant, in samples, for which the controller's settings were chosen. For an n
-# times longer time constant, the controller changes the command at every n-th sample.
+# Longest time constant, in samples, for which the controller's settings were chosen. For a time
+# constant that is n times as long, the controller changes the command at every n-th sample.
 LONGEST_TIME_CONSTANT: Final = 45.0
 
 
@@ -108,9 +108,10 @@ class SelfTuningController(ModelBasedController):
         self._check(positive, "setpoint_amplitude")
         self._check(integer, "setpoint_index", "error_index")
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
-        # On a slow plant, the controller changes the command at every `_samples_held`-th
-        # sample. The time constant, divided by the interval between these samples, is then at
-        # most twice `LONGEST_TIME_CONSTANT`.
+        # The settings suit time constants of up to about `LONGEST_TIME_CONSTANT` samples. So
+        # the controller changes the command of a slower plant only at every `_samples_held`-th
+        # sample. The time constant is then below twice `LONGEST_TIME_CONSTANT` of these
+        # intervals.
         time_constant = self.time_constant / self.sampling_interval  # samples
         self._samples_held = max(1, int(time_constant / LONGEST_TIME_CONSTANT))
         self._interval = self.sampling_interval * self._samples_held  # s

@@ -112,4 +112,4 @@ class SmithPredictor(InternalModelController):
         # For anti-windup, the integral follows the clipped flow instead of the wanted flow.
         limited = np.clip(wanted, self.u_min, self.u_max)
         self._integral = self._integral + self.ki / error_gain * (limited - self._integral)
-        return self._command(wanted)
+        return self._command(wanted)  # and updates the model's state

@@ -104,13 +104,12 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         Parameters
         ----------
         seed
-            Seed that restarts the random number streams, as the docstring of the class
+            Seed that restarts the random number streams, as the docstring of the subclass
             describes. Without a seed, the random number streams continue.
         options
             `reset_mask`, a bool array of shape (num_envs,), selects the plants to reset. The
-            first reset of an environment must include all plants. `MiddlePointTorchEnv` takes a
-            second option, `signals`. Unknown options are ignored, as in Gymnasium's
-            environments.
+            first reset of an environment must include all plants. Unknown options are ignored,
+            as in Gymnasium's environments.
 
         Returns
         -------
@@ -134,7 +133,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         if not self._was_reset and not mask.all():
             raise ResetNeeded("the first reset must include all environments")
         self._prepare(mask, seed, options or {})
-        infos = self._begin_episodes(mask, {})
+        infos = self._begin_episodes(mask, infos={})
         self._was_reset = True
         return self._window.present(), infos
 
@@ -177,7 +176,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             raise ResetNeeded(f"reset environments {ended_plants}, whose episodes have ended")
         a = self._checked_actions(actions)
         if reset_now is not None and reset_now.all():  # no plant advances
-            infos = self._begin_episodes(reset_now, {})
+            infos = self._begin_episodes(reset_now, infos={})
             rewards = self._zeros + 0.0  # a copy, as the caller may overwrite the rewards
             terminations = self._as_array(~reset_now)
             truncations = self._as_array(~reset_now)

@@ -208,7 +208,7 @@ valve travel 10 t/h; 100 episodes, all alike
     first = count("seed", seed, 0, 2**63 - 1)
     seeds = range(first, first + episodes)
     with opened(policy, env, episodes, arguments) as plants:
-        case = case_of(parameters_of(plants))
+        case = case_of(parameters_of(plants))  # without the arguments that change no bound
         # A user's code or wrapper may alter the episodes. Environments that are made from an id
         # without wrappers are one batch, which has no attribute `envs`.
         is_alterable = callable(env) or any("envs" in vars(layer) for layer in layers(plants))
@@ -253,8 +253,8 @@ def _run(
 ) -> _Runs:
     """Return the mean errors and valve travels of a policy in one episode for each seed.
 
-    If `is_replayed` is true, a second simulation of plants with the arguments `case` checks the
-    episodes.
+    The result also has the length of the shortest episode. If `is_replayed` is true, a second
+    simulation of plants with the arguments `case` checks the episodes.
     """
     n = plants.num_envs
     rounds: list[_Runs] = []

@@ -149,7 +149,7 @@ def opened(policy: Any, env: Any, n: int, arguments: Mapping[str, Any]) -> Itera
     ------
     ValueError
         If `env` is an existing environment, or is not of this package, or does not fit the
-        policy.
+        policy, or if normalisation statistics cannot be frozen or were never updated.
     """
     plants = _make_plants(policy, env, n, arguments)
     try:
@@ -168,6 +168,7 @@ def _make_plants(policy: Any, env: Any, n: int, arguments: Mapping[str, Any]) ->
 
             return _FromVecEnv(like(policy, env, n, **arguments))
         if isinstance(env, EnvSpec) and env.additional_wrappers:
+            # A batch cannot have these wrappers of single environments.
             return gymnasium.make_vec(
                 env, n, vectorization_mode="sync", disable_env_checker=True, **arguments
             )

@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from mptc_gym.plant.parameters import INTERFACE
 from mptc_gym.vector_env import parameters_of
 
-# Wrappers that only record: `like` leaves them out.
+# Wrappers that only record or check: `like` leaves them out.
 _RECORDERS = "Monitor", "RecordEpisodeStatistics", "RecordVideo"
 _VEC_RECORDERS = VecMonitor, VecVideoRecorder, VecCheckNan
 
@@ -227,7 +227,7 @@ def like(
     The plants are those of `env`. The observation windows, the action form (`action`,
     `max_move` and `compensated_dead_zone`), the Gymnasium wrappers, the `VecFrameStack` and a
     frozen copy of the statistics of the `VecNormalize` are those of the model's training.
-    Wrappers that only record are left out.
+    Wrappers that only record or check are left out.
 
     Parameters
     ----------
@@ -235,12 +235,12 @@ def like(
         Model of Stable-Baselines3 that has its training environments, as after
         `PPO.load(path, env=...)`.
     env
-        Id or `EnvSpec` of the environment.
+        Id or `EnvSpec` of the environment. Wrappers of an `EnvSpec` are left out.
     n_envs
         Number of plants.
     **arguments
-        Further arguments of the environment, as in `gymnasium.make`, which replace those of the
-        training.
+        Further arguments of the environment, as in `gymnasium.make`, which replace those of
+        `env` and of the training.
 
     Raises
     ------
@@ -273,7 +273,7 @@ def like(
     if wrappers:
         plants = DummyVecEnv([partial(gymnasium.make, spec)] * n_envs)
     else:
-        # With a seed, as a random one would change the random numbers of the training.
+        # Without a seed, Stable-Baselines3 draws one from `np.random`, which the training uses.
         plants = make_vec_env(spec, n_envs, seed=0)
     return _in_layers_of(training, plants)
 

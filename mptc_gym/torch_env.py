@@ -354,6 +354,7 @@ class _Plants:
         # One delayed flow for each sample, and earlier flows for the further terms of B.
         rows = samples + len(beta) - 1
         rows_of_all_delays = rows + self._longest_delay - self._shortest_delay
+        # The first row is that of the longest delay and the last term of B.
         flows = torch.stack([*islice(self._flows, rows_of_all_delays)])
         if isinstance(self._numbers.delay, Tensor):
             flows = flows.gather(0, self._delayed_rows[:rows])
@@ -546,7 +547,7 @@ class MiddlePointTorchEnv(BatchEnv):
         self._numbers: dict[str, Any] = dict(vars(parameters.lowest))
         self._numbers |= dict.fromkeys(parameters.ranges, self._zeros)
         self._start: SampleNumber = 0  # clock at k = 0 of all plants or of each plant
-        self._changes: list[int] = []  # clocks at which load or dynamics change, modulo 10
+        self._change_phases: list[int] = []  # clocks of changes of load or dynamics, modulo 10
         levels = SetPointLevels(parameters)
         setpoint = _RandomSetPoint if levels.random else _RepeatedSetPoint
         random = self._zeros, self._generator
@@ -622,8 +623,8 @@ class MiddlePointTorchEnv(BatchEnv):
         samples = max(1, min(self._most_samples, self._next_end - self._clock + 1))
         # Load and dynamics may change at the first sample of the block, which is the present
         # clock, but not at later samples of the block.
-        for change in self._changes:
-            samples_to_change = (change - self._clock - 1) % DRIFT_INTERVAL + 1  # 1 to 10
+        for phase in self._change_phases:
+            samples_to_change = (phase - self._clock - 1) % DRIFT_INTERVAL + 1  # 1 to 10
             samples = min(samples, samples_to_change)
         self._block_samples = samples
         k = self._clock - self._start
@@ -642,14 +643,14 @@ class MiddlePointTorchEnv(BatchEnv):
         blocks["observed_setpoint"] = setpoint.clone()
         blocks["observed_error"] = setpoint - reading
         blocks["observed_output"] = reading
-        for name in ("terminations", "truncations"):
+        for name in ("terminations", "truncations"):  # `step` truncates the last step
             blocks[name] = torch.zeros_like(output, dtype=torch.bool)
         rows = {name: block.unbind() for name, block in blocks.items()}
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         shared: Infos = {f"_{name}": everyone for name in self._info_names}
         if self.parameters.drifts:
             shared |= zip(FACTORS, self._plants.factors, strict=True)
-        for i in reversed(range(samples)):
+        for i in reversed(range(samples)):  # the next step last, for `pop`
             self._ahead.append({name: values[i] for name, values in rows.items()} | shared)
 
     def _end_block(self) -> None:
@@ -684,7 +685,7 @@ class MiddlePointTorchEnv(BatchEnv):
         if self.parameters.is_disturbed or self.parameters.drifts:
             # Load and dynamics of a plant change when its sample number k is a multiple of 10.
             # These are Python numbers, as reading a tensor would wait for the device.
-            self._changes = np.unique(starts % DRIFT_INTERVAL).tolist()
+            self._change_phases = np.unique(starts % DRIFT_INTERVAL).tolist()
         k = self._clock - self._start
         infos: dict[str, Tensor] = {}
         for name, (low, high) in self.parameters.ranges.items():

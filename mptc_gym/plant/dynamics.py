@@ -327,7 +327,7 @@ class Plant:
         self.factors: dict[str, float] = {}
         self._k = 0
         self._dynamics = Dynamics(parameters)
-        self._update_dynamics()
+        self._update_dynamics()  # which sets `_alpha`, `_scale` and `_load_gain`
         # Past temperatures and applied flows, the newest first.
         delay = int(numbers.delay)
         past_flows = delay + len(parameters.b)
@@ -345,7 +345,7 @@ class Plant:
             Normalised action a(k): -1 commands the flow `u_min`, and 1 commands the flow
             `u_max`.
         noise
-            Coloured noise n(k+1) of equation (28) of the paper, degC.
+            Coloured noise C(z^-1) xi(k+1) of equation (28) of the paper, degC.
         load
             Load disturbance w(k+1), degC.
 
@@ -370,13 +370,13 @@ class Plant:
             applied = u_min
         elif command > self._u_max:
             applied = self._u_max
-        # Equation (28): the sum of B times past flows, the load, and A times past temperatures.
+        # Equation (28), and the load, which is not in the paper.
         flows = self._flows
         flows.appendleft(applied)
         response = 0.0
         for lag, beta in self._beta:
             response += beta * flows[lag]
-        if load:
+        if load:  # With its gain, a constant load w adds w to the steady temperature.
             noise += self._load_gain * load
         output = noise + self._scale * response
         outputs = self._outputs
@@ -494,7 +494,7 @@ class PlantBatch:
         # -0, which adding 0 turns into 0.
         applied *= np.abs(command) >= self._least_effective_command
         applied += _ARRAY_OF_0
-        # Equation (28): the sum of B times past flows, the load, and A times past temperatures.
+        # Equation (28), and the load, which is not in the paper.
         response = self._input_response.add(applied)
         if self._parameters.changes_dynamics:
             response = self._scale * response

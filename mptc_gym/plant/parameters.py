@@ -367,14 +367,14 @@ Parameters.__doc__ = insert_table(Parameters.__doc__)
 def full_signature(constructor: Callable[..., Any]) -> inspect.Signature:
     """Return the signature of an environment's `__init__` with all arguments of `Parameters`.
 
-    The returned signature, which help() and editors show, lists the arguments of `Parameters`
+    The returned signature, which help() and notebooks show, lists the arguments of `Parameters`
     in place of `**arguments`, and leaves out `self`.
     """
     parameters = list(inspect.signature(constructor).parameters.values())
     parameters = parameters[1:-1]  # without `self` and `**arguments`
     for parameter in inspect.signature(Parameters).parameters.values():
         annotation = parameter.annotation
-        if parameter.name in PLANT_NUMBERS:
+        if parameter.name in PLANT_NUMBERS:  # whose annotation is a type variable
             annotation = "float"
         if parameter.name in CAN_BE_RANGES:
             annotation = "float | Sequence[float]"

@@ -33,7 +33,9 @@ StreamsOfPlants = Mapping[int, RandomStreams] | Sequence[RandomStreams]  # by in
 
 SAMPLES_AT_A_TIME = 600  # samples of a signal that are generated together
 PLANTS_AT_A_TIME = 32  # so few that the random numbers stay in the cache of the CPU
-LOAD_INTERVAL = 10  # samples between two changes of the load disturbance, which is slow
+# Samples between two changes of the load disturbance, which is slow. The same samples change a
+# drifting plant (`dynamics.DRIFT_INTERVAL`).
+LOAD_INTERVAL = 10
 LOADS_AT_A_TIME = SAMPLES_AT_A_TIME // LOAD_INTERVAL  # load values generated together
 # Number of samples that no episode reaches, small enough to be added to another int64.
 UNLIMITED = 1 << 62
