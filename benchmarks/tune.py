@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 
 from benchmarks.controllers.known_plant import PAPER, KnownPlant
-from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.controllers.spans import SPANS, Spans, spans_for
 from benchmarks.lib.command import CommandError, Count, Folder, Parameter, command, options
 from benchmarks.lib.fan_out import with_progress_bar
@@ -44,9 +44,15 @@ NOTES = (
     "'not converged' is the share of runs that do not settle at the constant set point. "
     "'objective', which the search minimises, is the mean of the five medians, plus 'not "
     "converged' times the amplitude of the plant's set points, in °C. 'in the search' is the "
-    "objective of the same gains in the search. The last rows have the gains with which other "
-    "commands run the controller.",
+    "objective of the same gains in the search. The last rows have gains with which other "
+    "commands run the same kind of controller.",
 )
+# Controllers with the gains of a controller to tune, by the name of the latter.
+WITH_THE_SAME_GAINS = {
+    "nn": ["nn"],
+    "pi": ["pi", "pi-searched", "pi-simc"],
+    "dahlin": ["dahlin"],
+}
 PAPER_NOISE = PRESETS["noisy"]["noise_variance"]  # noise variance R of the paper, degC^2
 # Arguments of the environment for a plant without noise and load disturbance.
 QUIET: Arguments = {
@@ -79,7 +85,8 @@ class Options:
     controller: Annotated[str, Parameter(choices=SPANS)] = field(kw_only=False)
     """Name of the controller whose gains to search."""
     trials: Count = 800
-    """Number of sets of gains to try, with those of a search that goes on."""
+    """Number of sets of gains to try, with those of a search that goes on. The first 200 are
+    random."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     out: Folder = None
 
@@ -148,17 +155,17 @@ def finals(
     for trial in sorted(trials, key=attrgetter("value"))[:FINALISTS]:
         gains = gains_of(trial.params, spans)
         rounded = {gain: float(f"{value:.3g}") for gain, value in gains.items()}
-        scores = score(name, plant, rounded, FINAL_RUNS, FINAL_FIRST_RUN)
+        controller = replace(ROSTER[name], arguments=rounded)
+        scores = score(controller, plant, FINAL_RUNS, FINAL_FIRST_RUN)
         row = {"gains": "of the search", **rounded, **scores, "in the search": trial.value}
         rows.append(row)
     rows.sort(key=lambda row: row["objective"])
-    for spec in ROSTER.values():
-        if (
-            spec.make is ROSTER[name].make
-        ):  # the same controller, such as "pi-searched" for "pi"
-            controller, _ = spec.start(plant, 1, 0)
-            gains = {gain: getattr(controller, gain) for gain in spans}
-            scores = score(name, plant, gains, FINAL_RUNS, FINAL_FIRST_RUN)
+    for present in WITH_THE_SAME_GAINS[name]:
+        spec = ROSTER[present]
+        if spec.direction in (None, KnownPlant(plant).direction):
+            started, _ = spec.start(plant, 1, 0)
+            gains = {gain: getattr(started, gain) for gain in spans}
+            scores = score(spec, plant, FINAL_RUNS, FINAL_FIRST_RUN)
             row = {"gains": f"of {spec.label}", **gains, **scores, "in the search": ""}
             rows.append(row)
     return rows
@@ -254,7 +261,8 @@ def search(
             seed=SEED + i, n_startup_trials=STARTUP, multivariate=True, constant_liar=False
         )
         trial = study.ask(magnitudes)
-        scores = score(name, plant, gains_of(trial.params, spans), RUNS, FIRST_RUN)
+        controller = replace(ROSTER[name], arguments=gains_of(trial.params, spans))
+        scores = score(controller, plant, RUNS, FIRST_RUN)
         study.tell(trial, scores["objective"])
     return study.get_trials(states=is_complete)
 
@@ -265,9 +273,9 @@ def gains_of(magnitudes: Mapping[str, float], spans: Spans) -> dict[str, float]:
 
 
 def score(
-    name: str, plant: Arguments, gains: Mapping[str, float], runs: int, first_run: int
+    controller: ControllerSpec, plant: Arguments, runs: int, first_run: int
 ) -> dict[str, float]:
-    """Run a controller with the gains `gains` in all cases, and return the results by name.
+    """Run a controller in all cases, and return the results by name.
 
     The results contain:
 
@@ -279,18 +287,15 @@ def score(
 
     Parameters
     ----------
-    name
-        Name of the controller.
+    controller
+        Record of the controller, with its gains.
     plant
         Arguments of the environment for the plant.
-    gains
-        The gains by name.
     runs
         Number of runs of each case.
     first_run
         Seed of the first run of the first case.
     """
-    controller = replace(ROSTER[name], arguments=gains)
     medians: dict[str, float] = {}
     unsettled = 0.0
     for i, (case_name, case) in enumerate(cases(plant).items()):

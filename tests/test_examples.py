@@ -109,7 +109,8 @@ def test_a_bump_test_gives_the_plant_that_made_it(flow_before, tmp_path, capsys)
         (lambda log: log.replace({"time": {140.0: "noon"}}), 1.5, "could not convert.*noon"),
         (lambda log: log.replace({"flow": {1.4: np.nan}}), 1.5, "a number in each row"),
         (lambda log: log.drop(10), 1.5, "from 4 s to 8 s apart, the latter after 136 s"),
-        (lambda log: log.assign(flow=log.flow.clip(-1, 1)), 1.5, "outside of the dead zone"),
+        (lambda log: log.assign(flow=log.flow.clip(-1, 1)), 1.5, "outside the dead zone"),
+        (lambda log: log.assign(flow=9.0 * (log.time > 400)), 1.5, "move twice or more"),
         (lambda log: log, -1.5, "dead_zone must be"),
     ],
 )

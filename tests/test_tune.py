@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -41,7 +42,8 @@ def test_cases_scale_with_the_plant():
 
 
 def test_no_control_pays_for_not_settling():
-    scores = tune.score("pi", {}, {"kp": 0.0, "ki": 0.0}, 2, 0)
+    idle = replace(ROSTER["pi"], arguments={"kp": 0.0, "ki": 0.0})
+    scores = tune.score(idle, {}, 2, 0)
     assert scores["constant"] == pytest.approx(4.8)  # all of the set point, all the time
     assert scores["learnt"] == pytest.approx(5.2)
     assert scores["not converged"] == 1.0
@@ -95,7 +97,10 @@ class TestSearch:
         chosen = f"--plant {plant} --set dead_zone=5.0"
         assert tune.main(f"pi --trials 3 {chosen} --out {tmp_path}/pi".split()) == 0
         file = tmp_path / "pi/gains.json"
-        assert capsys.readouterr().out.strip().endswith(f"my-pi={file} {chosen}")
+        printed = capsys.readouterr().out.strip()
+        assert printed.endswith(f"my-pi={file} {chosen}")
+        assert "of PI (SIMC)" in printed
+        assert "of PI (1992)" not in printed  # which would run in positive feedback
         (spec,) = own_controllers([f"mine={file}"]).values()
         assert spec.direction == 1
         controller, _ = spec.start({"b": [0.0456, 0.00404]}, 1, 0)
@@ -118,9 +123,10 @@ class TestSearch:
             gains = {gain: row[gain] for gain in spans}
             (trial,) = [trial for trial in best if trial.value == row["in the search"]]
             assert gains == {gain: float(f"{trial.params[gain]:.3g}") for gain in spans}
-            new_runs = tune.score(name, {}, gains, 3, tune.FINAL_FIRST_RUN)
+            controller = replace(ROSTER[name], arguments=gains)
+            new_runs = tune.score(controller, {}, 3, tune.FINAL_FIRST_RUN)
             assert row["objective"] == new_runs["objective"]
-        controllers = [name, "pi-searched"] if name == "pi" else [name]
+        controllers = tune.WITH_THE_SAME_GAINS[name]
         case = tune.cases({})["dead zone"]
         for row, present in zip(others, controllers, strict=True):
             seed = tune.FINAL_FIRST_RUN + tune.SPACING_OF_CASES
@@ -147,7 +153,7 @@ class TestSearch:
         assert tune.main([*words, "--set", "delay=3"]) == 0
         before = len(calls)
         assert tune.main(words) == 0
-        assert len(calls) == before + 2 + 2 + 2  # 4 are kept; then 2 finalists, 2 present gains
+        assert len(calls) == before + 2 + 2 + 3  # 4 are kept; then 2 finalists, 3 present gains
         assert gains_in(parts) == gains_in(whole)
         stored = [tune.search("pi", {}, SPANS["pi"](PAPER), 6, out) for out in (whole, parts)]
         gains, same_gains = ([trial.params for trial in trials] for trials in stored)

@@ -124,9 +124,10 @@ def main(
     except ValueError as error:
         raise SystemExit(str(error)) from error
     applied = np.where(np.abs(log.flow) < dead_zone, 0.0, np.clip(log.flow, u_min, u_max))
-    if np.ptp(applied) == 0.0:
+    if np.count_nonzero(np.diff(applied)) < 2:  # The fit could take one move for the start.
         raise SystemExit(
-            f"{log_file}: the flow must move outside of the dead zone and within the limits"
+            f"{log_file}: the flow must move twice or more, outside the dead zone and within "
+            "the limits"
         )
     temperature = log.temperature.to_numpy()
     delay, pole = fit_lag(applied, temperature)
