@@ -222,8 +222,9 @@ def search(
     """Try `count` sets of gains of a controller, and return the trials.
 
     Optuna stores the trials in `folder`, trial by trial. A search that starts again goes on
-    after the stored trials of the same controller and plant, and tries the gains that it would
-    have tried without an interruption.
+    after the stored trials, and tries the gains that it would have tried without an
+    interruption. A `CommandError` is raised if the trials in `folder` are of another controller
+    or plant.
 
     Parameters
     ----------
@@ -242,11 +243,12 @@ def search(
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend
 
-    study = optuna.create_study(
-        storage=JournalStorage(JournalFileBackend(str(folder / "trials.log"))),
-        study_name=json.dumps([name, plant]),
-        load_if_exists=True,
-    )
+    storage = JournalStorage(JournalFileBackend(str(folder / "trials.log")))
+    study_name = json.dumps([name, plant])
+    names = optuna.study.get_all_study_names(storage)
+    if names and study_name not in names:
+        raise CommandError(f"--out: {folder} has another search, {names[0]}")
+    study = optuna.create_study(storage=storage, study_name=study_name, load_if_exists=True)
     magnitudes: Any = {
         gain: optuna.distributions.FloatDistribution(abs(least), abs(most), log=True)
         for gain, (least, most) in spans.items()

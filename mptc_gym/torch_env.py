@@ -443,7 +443,8 @@ class MiddlePointTorchEnv(BatchEnv):
     `MiddlePointTorchEnv` has the plant, the spaces, the reward, the infos and the arguments of
     `MiddlePointEnv`, and resets plants as `MiddlePointVectorEnv` does. Without random signals
     and ranges, `MiddlePointTorchEnv` and `MiddlePointVectorEnv` return the same values for the
-    same actions, up to rounding.
+    same actions, up to rounding. Rounding also decides whether a command exactly on the edge of
+    the dead zone has an effect.
 
     Use `MiddlePointTorchEnv` to train on a GPU, on thousands of noisy plants, or with gradients
     through the plant. On a CPU, a small number of plants runs faster in NumPy, with

@@ -65,6 +65,7 @@ REFUSED = {
         (["--set", "delay"], "--set: delay must be an integer from 0"),
         (["--set", "dely=3"], "unexpected keyword argument 'dely'"),
         (["--set", "render_mode=human"], "unexpected keyword argument 'render_mode'"),
+        (["--set", "action=change"], "--set: action must be left out, as each controller"),
         (["--agent", "PI=agents:PIController"], "a NAME that no other controller has"),
         (["--agent", "=agents:PIController"], "'=agents:PIController' must have"),
         (["--agent", "mine"], "must have the form NAME=MODULE:FACTORY"),

@@ -157,6 +157,11 @@ class TestOwnControllers:
             errors(member, 3, 1200, **PRESETS["noisy"]), expected.errors, rtol=0, atol=1e-12
         )
 
+    def test_a_factory_cannot_choose_another_plant(self, written):
+        (member,) = members_of(written("def Mine():\n    return abs, {'delay': 0}\n"))
+        with pytest.raises(ValueError, match="got delay"):
+            member.start({}, 1, 0)
+
     @pytest.mark.parametrize("factory", ["ppo", "ppo_normalised"])
     def test_a_model_of_stable_baselines3_enters_by_the_lines_of_the_page(
         self, factory, written, tmp_path, monkeypatch

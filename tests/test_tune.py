@@ -149,8 +149,9 @@ class TestSearch:
         words = f"pi --trials 6 --out {parts}".split()
         assert tune.main(words) == 130
         assert f"with --out {parts}, the same command goes on" in capsys.readouterr().err
-        # A search on another plant has no influence.
-        assert tune.main([*words, "--set", "delay=3"]) == 0
+        # A search on another plant needs another folder.
+        assert tune.main([*words, "--set", "delay=3"]) == 2
+        assert f"--out: {parts} has another search" in capsys.readouterr().err
         before = len(calls)
         assert tune.main(words) == 0
         assert len(calls) == before + 2 + 2 + 3  # 4 are kept; then 2 finalists, 3 present gains

@@ -24,6 +24,7 @@ from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.measures import Agent, IdleValve, Trajectory, make_plants, rollout
+from mptc_gym.plant.parameters import INTERFACE
 
 # Ratio of the closed-loop time constant of Dahlin's controller to the plant's time constant.
 # The small ratio makes the control loop fast; the filter time constant makes the control loop
@@ -101,12 +102,16 @@ class ControllerSpec:
         `plant` are arguments of the environment. The returned arguments define the plant and
         the controller's observation.
         """
-        # A controller gets the paper's windows, or those for which its `make` asks. The windows
-        # in `plant` are for other policies.
+        # A controller gets the paper's windows, or those for which its `make` asks.
         arguments = {**plant, **PAPER_WINDOWS}
         agent = self.make(KnownPlant(arguments), runs, seed, **self.arguments)
         if isinstance(agent, tuple):
             agent, interface = agent
+            changes = set(interface) - set(INTERFACE)
+            if changes:  # With another plant, the controller would be compared unfairly.
+                raise ValueError(
+                    f"a controller may choose {', '.join(INTERFACE)}, got {', '.join(changes)}"
+                )
             arguments |= interface
         return agent, arguments
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 from benchmarks.lib.command import CommandError, Parameter, options
 from mptc_gym import PRESETS, Parameters
+from mptc_gym.plant.parameters import INTERFACE
 
 Arguments = dict[str, Any]  # keyword arguments of the environment `MiddlePoint-v0`
 
@@ -172,8 +173,8 @@ class PlantOptions:
     def arguments(self) -> Arguments:
         """Return the arguments of the environment that --preset, --plant and --set choose.
 
-        A `CommandError` is raised if an argument is unknown or invalid, or if the file cannot
-        be read.
+        A `CommandError` is raised if an argument is unknown or invalid, or not one of the
+        plant, or if the file cannot be read.
         """
         arguments: Arguments = {}
         if self.preset:
@@ -185,6 +186,12 @@ class PlantOptions:
             arguments[name] = value  # a bare word, such as random
             with suppress(ValueError):
                 arguments[name] = json.loads(value)
+        interface = [name for name in INTERFACE if name in arguments]
+        if interface:
+            raise CommandError(
+                f"--plant, --set: {', '.join(interface)} must be left out, as each controller "
+                "has its own observations and actions"
+            )
         try:
             Parameters(**arguments)
         except (TypeError, ValueError) as error:  # A TypeError names an unknown argument.
