@@ -3,6 +3,7 @@
 import copy
 import pickle
 import re
+import textwrap
 
 import numpy as np
 import pytest
@@ -160,6 +161,18 @@ class TestOwnControllers:
     def test_a_factory_cannot_choose_another_plant(self, written):
         (member,) = members_of(written("def Mine():\n    return abs, {'delay': 0}\n"))
         with pytest.raises(ValueError, match="got delay"):
+            member.start({}, 1, 0)
+
+    def test_a_model_cannot_lose_its_statistics(self, written):
+        code = """
+            from stable_baselines3 import PPO
+            from stable_baselines3.common.vec_env import VecNormalize
+            from mptc_gym.sb3 import make_vec_env
+            def Mine():
+                return PPO("MlpPolicy", VecNormalize(make_vec_env("MiddlePoint-v0", 1)))
+        """
+        (member,) = members_of(written(textwrap.dedent(code)))
+        with pytest.raises(ValueError, match="VecNormalize must come as a function"):
             member.start({}, 1, 0)
 
     @pytest.mark.parametrize("factory", ["ppo", "ppo_normalised"])

@@ -113,6 +113,12 @@ class ControllerSpec:
                     f"a controller may choose {', '.join(INTERFACE)}, got {', '.join(changes)}"
                 )
             arguments |= interface
+        # The plants of a comparison have no wrappers, so the statistics would be left out.
+        if getattr(agent, "get_vec_normalize_env", lambda: None)() is not None:
+            raise ValueError(
+                "a model with VecNormalize must come as a function of the observations, as "
+                "ppo_normalised in benchmarks/examples/train_your_own.md"
+            )
         return agent, arguments
 
     def run(self, plant: Mapping[str, Any], samples: int, runs: int, seed: int) -> Trajectory:
