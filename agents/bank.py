@@ -278,10 +278,10 @@ class Bank:
 
     def _renew_estimates(self) -> None:
         """Update the gains and probabilities of the models, and the means over the models."""
-        # Least squares, with the sums that `_learn` updates: of_prior is the weight of the
+        # Least squares, with the sums that `_learn` updates: prior_weight is the weight of the
         # gain's prior mean, which is 1.
-        of_prior = self.variance / GAIN_SPREAD**2
-        gains = (self._products + of_prior) / (self._information + of_prior)
+        prior_weight = self.variance / GAIN_SPREAD**2
+        gains = (self._products + prior_weight) / (self._information + prior_weight)
         self._gains = np.clip(gains, *GAIN_LIMITS)
         # Probabilities of the models of a plant, by the rule of Bayes. The axes 0 and 1 are the
         # models' delays and time constants.

@@ -74,12 +74,12 @@ class Law:
     ) -> None:
         self._bank = bank
         self.output_filter = OutputFilter(n)
-        self._dead_zone_edge = np.float32(dead_zone_edge)
+        self._dead_zone_edge = np.float32(dead_zone_edge)  # so that flows remain float32
         self._limits = limits
         self._random_setpoint = random_setpoint
         self._setpoint: Array | None = None
-        # Number of samples since the last change of the set point. Before a change, the number
-        # of observations since the start of the episode.
+        # Number of samples since the last change of the set point. Before the first change, the
+        # number of observations since the start of the episode.
         self._age: Array = np.zeros(n)
 
     def flow(self, setpoint: Array, output: Array) -> Array:

@@ -157,7 +157,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     flow skips a dead zone of the half width z: u = z + (u_max - z) v / u_max for v > 0, u = 0
     for v = 0, and u = -z + (u_min + z) v / u_min for v < 0. In observation and reward, the
     action a(k) then is the one that commands the flow u(k). A policy must know the wanted flow,
-    so the observation needs an `action_window` of at least 1.
+    so an `action_window` of at least 1 is advisable.
 
     ## Observation space
 

@@ -314,12 +314,12 @@ def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
             return Bound(np.repeat(least, len(seeds)))
         if first <= seeds.start and seeds.stop <= first + len(least):
             return Bound(least[seeds.start - first : seeds.stop - first])
-    known = [
+    seeds_with_bounds = [
         f"{first:,} to {first + len(least) - 1:,}" for first, least in least_by_seed.items()
     ]
     return Bound(
         None,
-        f"bounds of these plants are kept for seeds {' and '.join(known)}, not for "
+        f"bounds of these plants are kept for seeds {' and '.join(seeds_with_bounds)}, not for "
         f"{seeds.start:,} to {seeds.stop - 1:,}: choose seed and episodes among them",
     )
 

@@ -109,8 +109,8 @@ class Panel:
 
         The area is at least one pixel wide and high, so that `fill` draws lines, too; parts of
         the area to the left of the panel are left out. `low` and `high` have the unit of the
-        vertical axis, degC or t/h. The colours of the picture are
-        multiplied by `colour`, so that lines under the area remain visible.
+        vertical axis, degC or t/h. The colours of the picture are multiplied by
+        `colour`, so that lines under the area remain visible.
         """
         left, top = self._point(first, high)
         right, bottom = self._point(last, low)
@@ -127,10 +127,10 @@ class Panel:
         lines join the values.
         """
         points = list(map(self._point, range(self._first, self._record.k + 1), values))
-        if is_staircase:
+        if is_staircase:  # Each value is drawn at its own sample and at the next one.
             doubled = np.repeat(points, 2, axis=0)
             points = np.column_stack((doubled[1:, 0], doubled[:-1, 1])).tolist()
-        if len(points) > 1:
+        if len(points) > 1:  # as pygame draws no line through one point
             pygame.draw.lines(self._surface, colour, False, points, width)
 
     def heading(self, *labels: Label) -> None:

@@ -225,12 +225,12 @@ class _WantedFlows(WantedFlows):
         self._flows = self._flows.detach()
 
     def _rounded_actions(self, commands: Any) -> Any:
-        """Return the actions that `float32_action` returns in NumPy, with gradients."""
+        """Return actions for commands, as `float32_action` does in NumPy, with gradients."""
         actions = action_from_command(commands, self._u_min, self._u_max).to(torch.float32)
         rounded_commands = (actions.to(commands.dtype) + 1.0) * self._half_range + self._u_min
         had_effect = commands.abs() >= self._dead_zone
-        size = actions.detach().abs().clamp(min=1.0)
-        spacing = torch.nextafter(size, 2.0 * size) - size  # of float32 numbers
+        magnitude = actions.detach().abs().clamp(min=1.0)
+        spacing = torch.nextafter(magnitude, 2.0 * magnitude) - magnitude  # of float32 numbers
         is_lost = had_effect & (rounded_commands.abs() < self._dead_zone)
         return (actions + is_lost * spacing.copysign(commands.detach())).to(commands.dtype)
 
@@ -316,7 +316,7 @@ class _Plants:
         action. `noise` and `load` hold the coloured noise n and the load w, degC, shape
         (samples, n); None is a load that is always 0.
         """
-        if self._parameters.drifts:
+        if self._parameters.drifts:  # The plants change at the first sample of a block alone.
             self._update_dynamics(k)
         # The temperatures without the terms of earlier temperatures.
         forced = _add_product(noise, self._scale, self._response(samples))
@@ -325,7 +325,7 @@ class _Plants:
         for output in forced.unbind():
             for lag, alpha in enumerate(self._alpha, start=1):
                 output = _add_product(output, alpha, self._outputs[-lag])
-            self._outputs.append(output)
+            self._outputs.append(output)  # `end_block` shortens the list.
         return torch.stack(self._outputs[-samples:])
 
     def end_block(self, samples: int) -> None:

@@ -116,7 +116,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         if parameters.action == "change":
             self._wanted_flows = WantedFlows(parameters, num_envs)
         self._window = _Window(parameters.windows, num_envs)
-        self._actions = np.zeros(num_envs)  # the actions of the last step
+        self._last_actions = np.zeros(num_envs)
         # In comparisons, an array of shape (num_envs,) is faster than a Python number. In other
         # arithmetic, an array of shape () is faster than a Python number.
         self._zeros = np.zeros(num_envs)
@@ -174,7 +174,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         if reading is not output:
             observed_error = setpoint - reading
         observations = self._window.add(setpoint, observed_error, reading, a)
-        self._actions = a
+        self._last_actions = a
         mask = self._all_true.copy()
         # Copies of arrays that signals and plants use again, written out entry by entry, which
         # is faster than a loop.
@@ -215,7 +215,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             rewards = -np.abs(rewards)
         move_weight = self.parameters.move_weight
         if move_weight:
-            rewards -= move_weight * np.abs(a - self._actions)
+            rewards -= move_weight * np.abs(a - self._last_actions)
         return rewards
 
     def _readings(self, output: Values) -> Values:
@@ -244,7 +244,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             self._wanted_flows.reset(which)
         setpoint = self._signals.reset(which, self._streams, numbers)
         rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)
-        self._actions[which] = rest_action
+        self._last_actions[which] = rest_action
         self._window.reset(which, setpoint, rest_action)
         if self.render_mode is not None:
             interval = self.parameters.sampling_interval

@@ -34,7 +34,7 @@ _SCENARIOS_HELP = (
     f"The cases to run (default: all). The cases are {', '.join(SCENARIOS)}. With "
     f"--presets, the cases are {', '.join(PRESET_SCENARIOS)}. With --plant, --preset or --set, "
     f"the cases are {', '.join(setpoint.name for setpoint in SETPOINTS)}; or run, with the set "
-    f"point of the plant's arguments, if these have one."
+    "point of the plant's arguments, if these have one."
 )
 
 

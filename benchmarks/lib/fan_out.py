@@ -107,7 +107,8 @@ class FanOut:
         calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
         if self.backend == "ray":
             _connect_to_ray()
-            return joblib.Parallel(self.jobs or -1, backend="ray")(calls)  # type: ignore[no-any-return]
+            by_ray: list[Outcome] = joblib.Parallel(self.jobs or -1, backend="ray")(calls)
+            return by_ray
         # A terminal sends Ctrl-C to all processes, but only the first process shall act on it.
         with joblib.parallel_config(
             "loky",
@@ -118,7 +119,8 @@ class FanOut:
             parallel = joblib.Parallel(
                 self.jobs or -1, return_as="generator_unordered", batch_size=1
             )
-        return parallel(calls)  # type: ignore[no-any-return]
+        outcomes: Iterable[Outcome] = parallel(calls)
+        return outcomes
 
 
 def _attempt(name: str, task: Task) -> Outcome:

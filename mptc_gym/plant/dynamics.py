@@ -71,7 +71,8 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     Rounding to float32 can move a command from the edge of the dead zone into the dead zone:
     with the default limits, the action float32(0.7) commands 6.99999988 t/h, which is inside a
     dead zone of 7 t/h. If rounding moves a command into the dead zone, the action is moved out
-    of the dead zone by the spacing of float32 numbers near 1.
+    of the dead zone by the spacing of float32 numbers near 1, or near the action if its
+    magnitude is above 1.
 
     Parameters
     ----------
@@ -94,6 +95,7 @@ def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDAr
     rounded_commands = (actions.astype(float) + 1.0) * half_range + u_min
     had_effect = np.abs(commands) >= dead_zone
     has_effect = np.abs(rounded_commands) >= dead_zone
+    # The plant adds 1 to the action, so the rounding of the sum could remove a smaller step.
     spacing = np.spacing(np.maximum(np.abs(actions), np.float32(1.0)))
     moved_actions = actions + np.copysign(spacing, commands).astype(np.float32)
     return np.where(had_effect & ~has_effect, moved_actions, actions)
@@ -328,7 +330,8 @@ class Plant:
         self._k = 0
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()  # which sets `_alpha`, `_scale` and `_load_gain`
-        # Past temperatures and applied flows, the newest first.
+        # Past temperatures and applied flows, the newest first. When `step` computes y(k+1),
+        # the first flow is u_a(k).
         delay = int(numbers.delay)
         past_flows = delay + len(parameters.b)
         self._outputs = deque([0.0] * len(self._alpha), maxlen=len(self._alpha))
@@ -526,7 +529,7 @@ class PlantBatch:
         if self._parameters.drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
         alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
-        self._alpha = tuple(map(np.asarray, alpha))
+        self._alpha = tuple(map(np.asarray, alpha))  # arrays, as for `_ARRAY_OF_0`
         samples_to_change = k_of_change + DRIFT_INTERVAL - k
         self._next_update = self._clock + int(samples_to_change.min())
 
@@ -536,9 +539,8 @@ class _InputResponse:
 
     B is the polynomial of equation (28) of the paper, u_a the applied flow and d the delay, in
     samples. With a shortest possible delay of s samples, a flow cannot affect the temperatures
-    of the next s samples. The responses to a block of s + 1 successive flows, where s is the
-    shortest possible delay in samples, are therefore computed at once, after the last flow of
-    the block, and then returned sample by sample.
+    of the next s samples. The responses to a block of s + 1 successive flows are therefore
+    computed at once, after the last flow of the block, and then returned sample by sample.
 
     The array `_flows` has one row of applied flows per sample, the oldest sample first. The
     last rows of `_flows` are the block of flows that `add` fills. The first rows of `_flows`
@@ -555,8 +557,8 @@ class _InputResponse:
         self._older_rows = len(self._beta) - 1 + self._longest - shortest
         self._flows = np.zeros((self._older_rows + self._block_rows, num_envs))
         self._response = np.zeros((self._block_rows, num_envs))
-        # Index of the next flow in the block of flows. The flow at k = 0 is the last flow of
-        # the first block, because all flows before k = 0 are 0.
+        # Index of the next flow in the block of flows. The first block could begin at any row,
+        # as all flows before k = 0 are 0. It has the flow at k = 0 alone.
         self._next_row = self._block_rows - 1
         # Used only if the delays of the plants differ. `_delayed_indices` selects, in the
         # flattened `_flows`, the flows to which each plant responds after the plant's own

@@ -171,7 +171,8 @@ class SetPointLevels:
         period = parameters.setpoint_period
         self.random = setpoint == "random"
         self.amplitude = parameters.setpoint_amplitude
-        self.shortest = max(1, math.ceil(period / 6))  # samples
+        # From a sixth to a half of the period, as the argument `setpoint_period` says; samples.
+        self.shortest = max(1, math.ceil(period / 6))
         self.longest = max(self.shortest, period // 2)
         self.values: list[float] = []
         self.lengths: list[int] = []
@@ -366,7 +367,7 @@ class Disturbance(_HeldSignal):
         """Set the load of the plants with the indices `plants` to the next value."""
         needs_loads = self._next_columns[plants] == LOADS_AT_A_TIME
         self._generate(plants[needs_loads])
-        columns = self._next_columns[plants]
+        columns = self._next_columns[plants]  # 0 where loads were generated
         self.present[plants] = self._loads[plants, columns]
         self._next_columns[plants] = columns + 1
         self._change_times[plants] += LOAD_INTERVAL
