@@ -104,7 +104,7 @@ def record(preset: str, behaviour: str, episodes: int = EPISODES) -> list[Episod
 def _record_controller(preset: str, controller_name: str, seeds: list[int]) -> list[Episode]:
     """Return recorded episodes, one for each seed, of a controller with a preset's plant."""
     from benchmarks.controllers.roster import ROSTER
-    from benchmarks.loop.measures import make_plants
+    from benchmarks.loop.runs import make_plants
 
     arguments = arguments_of(preset)
     controller: Any = ROSTER[controller_name].in_service(arguments, len(seeds), SEED)

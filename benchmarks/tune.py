@@ -96,7 +96,7 @@ def work(options: Options) -> None:
     import optuna  # here, so that no folder is made if Optuna is missing
     import pandas as pd
 
-    from benchmarks.lib.report import Section, show, write_report
+    from benchmarks.lib.sections import Section, show, write_report
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = options.controller

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from benchmarks.loop.measures import Trajectory
+from benchmarks.loop.runs import Trajectory
 from mptc_gym import MiddlePointVectorEnv
 from mptc_gym.plant import checks
 from mptc_gym.plant.parameters import ARGUMENTS, CAN_BE_RANGES, WINDOWS
@@ -43,7 +43,7 @@ BY_CHECK = {
     checks.at_least_1: st.floats(1, 100),
     checks.positive: st.floats(0.5, 4),
     checks.polynomial: polynomials,
-    checks.numbers: st.lists(small_numbers, min_size=1, max_size=5),
+    checks.number_list: st.lists(small_numbers, min_size=1, max_size=5),
     checks.reward: st.sampled_from(checks.REWARDS),
     checks.action: st.sampled_from(checks.ACTIONS),
     checks.share_of_range: st.floats(0.01, 2),

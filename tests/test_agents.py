@@ -21,7 +21,7 @@ from agents import (
 )
 from agents.networks import PRETRAINED
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.loop.measures import make_plants, rollout
+from benchmarks.loop.runs import make_plants, simulate
 from mptc_gym import PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from tests.conftest import STEP_TEST, assert_the_seed_is_all_that_differs
@@ -256,7 +256,7 @@ def test_with_the_right_model_the_delay_only_shifts_the_output(setpoint, actuato
     outputs = []
     for delay in (0, 18):
         smith = SmithPredictor(**{**TUNED, "delay": 8.0 * (delay + 1), **actuator})
-        trajectory = rollout(make_plants(1, 200, **plant, delay=delay), smith, 200, seed=0)
+        trajectory = simulate(make_plants(1, 200, **plant, delay=delay), smith, 200, seed=0)
         outputs.append(trajectory.output[delay : 182 + delay])
     np.testing.assert_allclose(*outputs, atol=1e-4)
 
@@ -267,7 +267,7 @@ def test_the_response_with_dahlins_controller_is_a_first_order_lag_after_the_del
     commands = []  # for an error of 0.5 degC at rest
     for filter_time_constant in (0.0, 100.0):
         controller = DahlinController(**TUNED, filter_time_constant=filter_time_constant)
-        found = rollout(make_plants(1, 119, **plant, setpoint=2.0), controller, 119, seed=0)
+        found = simulate(make_plants(1, 119, **plant, setpoint=2.0), controller, 119, seed=0)
         # lambda = 80 s is ten samples; the delay is 19.
         lag = 2.0 * (1.0 - np.exp(-samples / 10.0))
         np.testing.assert_allclose(found.output[18:118, 0], lag, atol=1e-4)
@@ -283,11 +283,11 @@ def test_no_controller_winds_up_at_a_limit_or_stays_in_the_dead_zone(make):
     controller = make(dead_zone=5.0)
     # 9 degC are out of reach; 6 degC take 8.8 t/h. The valve must leave its limit at once.
     plants = make_plants(1, 320, setpoint=[9.0] * 300 + [6.0])
-    applied = rollout(plants, controller, 320, seed=0).applied
+    applied = simulate(plants, controller, 320, seed=0).applied
     assert (applied[290:300] == -10.0).all()
     assert applied[300] > -10.0
     # 1 degC takes 1.5 t/h, inside the zone: now and then 5 t/h pass, and never more.
-    held = rollout(make_plants(1, 900, setpoint=1.0), controller, 900, seed=0)
+    held = simulate(make_plants(1, 900, setpoint=1.0), controller, 900, seed=0)
     assert set(np.abs(held.applied[100:]).ravel()) == {0.0, 5.0}
     assert np.abs(held.next_error[300:]).max() < 0.5
 

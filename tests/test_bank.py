@@ -8,7 +8,7 @@ from agents import SelfTuningController, output_filter
 from agents.bank import FAST_POLE, GAIN_SPREAD, NOISE_COLOUR
 from agents.hedge import RandomSetpoint
 from agents.output_filter import LOAD_MEMORY, READING_SHARE, OutputFilter
-from benchmarks.loop.measures import make_plants, rollout
+from benchmarks.loop.runs import make_plants, simulate
 from tests.conftest import STEP_TEST
 
 KNOWN = {**STEP_TEST, "dead_zone": 5.0}
@@ -34,7 +34,7 @@ def test_it_identifies_the_plant(delay, gain, time_constant, noise):
         2, 1200, delay=delay, gain_factor=gain, noise_variance=noise,
         time_constant_factor=time_constant, setpoint_period=240,
     )  # fmt: skip
-    rollout(plants, controller, 1200, 5_900_000)
+    simulate(plants, controller, 1200, 5_900_000)
     estimates = controller.estimates
     assert estimates["delay"] == pytest.approx(np.full(2, 8.0 * (delay + 1)), abs=1.0)
     assert estimates["gain"] == pytest.approx(np.full(2, GAIN * gain), rel=0.1)
@@ -101,7 +101,7 @@ def test_neither_a_wrong_gain_nor_a_steady_load_leaves_an_offset():
     controller = SelfTuningController(**{**KNOWN, "dead_zone": 0.0})
     load = {"disturbance_amplitude": 2.0, "disturbance_interval": 1e6, "setpoint": 4.0}
     plants = make_plants(1, 900, dead_zone=0.0, gain_factor=1.2, **load)
-    trajectory = rollout(plants, controller, 900, 5_900_000)
+    trajectory = simulate(plants, controller, 900, 5_900_000)
     errors = (trajectory.setpoint - trajectory.output)[700:]
     assert np.abs(errors).mean() < 0.05
 

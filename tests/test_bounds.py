@@ -17,7 +17,8 @@ from benchmarks.bounds.prediction import noise_variance
 from benchmarks.bounds.unknown import error_bounds, load_changes
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import LinearModel
-from benchmarks.loop.measures import make_plants, mean_error, rollout
+from benchmarks.loop.measures import mean_error
+from benchmarks.loop.runs import make_plants, simulate
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import Parameters
 from mptc_gym.plant.dynamics import action_from_command
@@ -29,7 +30,7 @@ SHARES = np.linspace(0.0, 1.0, 21)  # of the known level of the load, in a forec
 
 def run_mpc(runs, samples, seed=0, **arguments):
     controller = PredictiveController(Parameters(**arguments), runs)
-    return rollout(make_plants(runs, samples, **arguments), controller, samples, seed)
+    return simulate(make_plants(runs, samples, **arguments), controller, samples, seed)
 
 
 def minimum_variance(parameters):
@@ -126,7 +127,7 @@ class TestProgramme:
         assert flow.min() == pytest.approx(-12.0)
         actions = iter(action_from_command(flow, -12.0, 6.0))
         knowing = SimpleNamespace(reset=dict, act=lambda _: np.full((1, 1), next(actions)))
-        runs = rollout(make_plants(1, 301, **case), knowing, 300, seed=0)
+        runs = simulate(make_plants(1, 301, **case), knowing, 300, seed=0)
         of_run = np.abs(setpoint - runs.output[:, 0])
         np.testing.assert_allclose(of_run, error[:-1], atol=1e-4)
         run_errors = mean_error(runs)

@@ -15,13 +15,14 @@ import pytest
 
 from agents import PIController
 from benchmarks.bounds.least import least_possible
-from benchmarks.compare import plots, runs
+from benchmarks.compare import plots
 from benchmarks.compare.__main__ import main
+from benchmarks.compare.cases import bound_of, run_case
 from benchmarks.compare.estimates import estimate, ranked
-from benchmarks.compare.runs import bound_of, run_case
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.loop.measures import make_plants, mean_error, measure, rollout
+from benchmarks.loop.measures import mean_error, measure
+from benchmarks.loop.runs import make_plants, simulate
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
@@ -63,7 +64,7 @@ def test_measures_by_hand(signals, expected):
 
 
 def test_what_the_parts_of_a_run_add_to_its_error():
-    runs = rollout(make_plants(2, 1200, noise_variance=0.5), PIController(2.2, 0.3), 1200, 0)
+    runs = simulate(make_plants(2, 1200, noise_variance=0.5), PIController(2.2, 0.3), 1200, 0)
     names = "mae_start", "mae_changes", "mae_steady"
     values = measure(runs, Parameters())
     np.testing.assert_allclose(sum(values[name] for name in names), values["mae"])
@@ -218,7 +219,9 @@ class TestCompare:
     ):
         finished = [("pi", "constant"), ("pi", "load"), ("smith", "constant")]
         results = [run_case(SCENARIOS[case], ROSTER[name], 1, 0) for name, case in finished]
-        monkeypatch.setattr(runs, "run_case", Mock(side_effect=[*results, KeyboardInterrupt]))
+        monkeypatch.setattr(
+            "benchmarks.compare.cases.run_case", Mock(side_effect=[*results, KeyboardInterrupt])
+        )
         out = compared("--agents pi smith --scenarios constant load --runs 1", status=130)
         said = "interrupted: 1 of 6 tasks are missing"
         page = (out / "report.md").read_text()
@@ -274,7 +277,8 @@ class TestCompare:
     ):
         constant = bound_of(SCENARIOS["constant"], 1, SEED)
         monkeypatch.setattr(
-            runs, "bound_of", lambda scenario, *_: constant._replace(scenario=scenario)
+            "benchmarks.compare.cases.bound_of",
+            lambda scenario, *_: constant._replace(scenario=scenario),
         )
         long = f"{30 * 'x'}=agents:PIController"
         compared(f"{cases} --agents pi-searched idle --runs 1 --agent {long}")

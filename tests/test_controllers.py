@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.loop.measures import make_plants, mean_error, rollout
+from benchmarks.loop.measures import mean_error
+from benchmarks.loop.runs import make_plants, simulate
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
 from mptc_gym.sb3 import make_vec_env
@@ -37,7 +38,7 @@ def member(entry):
 
 def run_again(agent, plant, samples, runs, seed):
     """Run a controller that may have run before."""
-    return rollout(make_plants(runs, samples, **plant), agent, samples, seed)
+    return simulate(make_plants(runs, samples, **plant), agent, samples, seed)
 
 
 def test_each_controller_controls_another_plant(entry, member):

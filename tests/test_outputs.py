@@ -10,7 +10,7 @@ import pytest
 from benchmarks.lib import outputs
 from benchmarks.lib.command import CommandError
 from benchmarks.lib.outputs import commit, new_folder
-from benchmarks.lib.report import Section, on_screen, write_report
+from benchmarks.lib.sections import Section, on_screen, write_report
 
 
 @pytest.fixture(autouse=True)

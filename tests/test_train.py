@@ -14,7 +14,7 @@ from agents.networks import PRETRAINED
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.examples import sb3
-from benchmarks.loop.measures import make_plants
+from benchmarks.loop.runs import make_plants
 from benchmarks.train import __main__ as program
 from benchmarks.train import ppo
 from tests.conftest import ROOT

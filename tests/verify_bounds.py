@@ -9,7 +9,7 @@ import pandas as pd
 
 from benchmarks.bounds.least import least_possible
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
-from benchmarks.lib.report import on_screen
+from benchmarks.lib.sections import on_screen
 from benchmarks.lib.statistics import student
 from benchmarks.loop.measures import mean_error
 from benchmarks.loop.scenarios import SCENARIOS

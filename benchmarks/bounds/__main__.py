@@ -87,7 +87,7 @@ def work(options: Options) -> None:
     """
     import pandas as pd
 
-    from benchmarks.lib.report import Section, show
+    from benchmarks.lib.sections import Section, show
 
     if options.package:
         write_package(options.fan_out)

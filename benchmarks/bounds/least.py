@@ -31,13 +31,7 @@ from benchmarks.bounds.linear_program import (
 from benchmarks.bounds.unknown import error_bounds
 from benchmarks.lib.statistics import Estimate, student
 from benchmarks.loop.linear import LinearModel
-from benchmarks.loop.measures import (
-    IdleValve,
-    drawn_numbers,
-    is_random,
-    make_plants,
-    rollout,
-)
+from benchmarks.loop.runs import IdleValve, drawn_numbers, is_random, make_plants, simulate
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
 from mptc_gym.plant.parameters import PlantNumbers
@@ -170,7 +164,7 @@ def _episodes_of(parameters: Parameters, samples: int, episodes: int, seed: int)
     numbers = drawn_numbers(parameters, episodes, seed)
     with closing(make_plants(episodes, samples + 1, **asdict(parameters))) as plants:
         idle_valve = IdleValve(numbers.u_min, numbers.u_max)
-        trajectory = rollout(plants, idle_valve, samples + 1, seed)
+        trajectory = simulate(plants, idle_valve, samples + 1, seed)
     return _Episodes(
         numbers=[plant_numbers(numbers, i) for i in range(episodes)],
         setpoints=trajectory.setpoint.T,

@@ -29,7 +29,7 @@ def work(options: Options) -> None:
     from benchmarks.claims.claims import CLAIMS, examined
     from benchmarks.claims.findings import sections, table
     from benchmarks.claims.runs import Batch
-    from benchmarks.lib.report import show, write_report
+    from benchmarks.lib.sections import show, write_report
 
     chosen = choose("CLAIM", options.claims or list(CLAIMS), CLAIMS)
     batch = Batch(options.runs)

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from benchmarks.lib.report import Section
+from benchmarks.lib.sections import Section
 from benchmarks.lib.statistics import Estimate, quantile, share
 
 Finding = dict[str, Any]  # a row of the table of numbers, as `judge` returns it

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents import DirectNNController, PIController
-from benchmarks.loop.measures import Agent, Trajectory, make_plants, rollout
+from benchmarks.loop.runs import Agent, Trajectory, make_plants, simulate
 from mptc_gym.rollout import Act
 
 Array = NDArray[np.floating]
@@ -81,7 +81,7 @@ class Batch:
         length of a run, and `arguments` are arguments of the environment.
         """
         plants = make_plants(self.runs, samples, **arguments)
-        return rollout(plants, agent, samples, self.seed)
+        return simulate(plants, agent, samples, self.seed)
 
     def run_nn(self, samples: int, **arguments: Any) -> Trajectory:
         """Run the paper's network, and return the signals of all runs of the batch."""

@@ -68,8 +68,8 @@ def work(options: Options) -> None:
     If a task fails or the user interrupts the comparison, the results of the controllers that
     have finished are written before an error is raised.
     """
+    from benchmarks.compare.cases import Bound, Result, bound_of, run_case
     from benchmarks.compare.report import write
-    from benchmarks.compare.runs import Bound, Result, bound_of, run_case
 
     chosen = choose("--agents", options.agents, ROSTER) | own_controllers(options.agent)
     controllers, note = fitting_the_gain(chosen, options.plant)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.compare.runs import Bound
+from benchmarks.compare.cases import Bound
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles
 
 BOOTSTRAP_SEED = 0  # seed of the resampling for confidence intervals, not of an episode
@@ -116,7 +116,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def write_numbers(path: Path, table: pd.DataFrame) -> None:
+def write_table(path: Path, table: pd.DataFrame) -> None:
     """Write a table of numbers, texts and objects of class `Estimate` to the CSV file `path`.
 
     A column NAME of estimates becomes three columns: NAME has the values, and NAME_low and

@@ -9,11 +9,11 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.compare import plots
-from benchmarks.compare.estimates import estimate, ranked, summarise, write_numbers
-from benchmarks.compare.runs import Bound, Result
+from benchmarks.compare.cases import Bound, Result
+from benchmarks.compare.estimates import estimate, ranked, summarise, write_table
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.command import CommandError
-from benchmarks.lib.report import Section, write_report
+from benchmarks.lib.sections import Section, write_report
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import Scenario
 
@@ -105,8 +105,8 @@ def write(
     """
     tables = [pd.DataFrame(columns) for result in results for columns in result.runs]
     runs = pd.concat(tables, ignore_index=True)
-    write_numbers(folder / "runs.csv", runs)
-    write_numbers(folder / "summary.csv", summarise(runs))
+    write_table(folder / "runs.csv", runs)
+    write_table(folder / "summary.csv", summarise(runs))
     responses = {}
     for name in runs["scenario"].unique():
         columns = [result.responses for result in results if result.scenario == name]
@@ -119,7 +119,7 @@ def write(
     reported_runs = runs[runs["scenario"].isin([bound.scenario.name for bound in bounds])]
     estimates = estimate(reported_runs, bounds)
     # Arrays do not fit into the cells of a CSV file.
-    write_numbers(folder / "estimates.csv", estimates.drop(columns="scores"))
+    write_table(folder / "estimates.csv", estimates.drop(columns="scores"))
     scores = ranked(estimates)
     comparison = Comparison(controllers, bounds, results, reported_runs, estimates, scores)
     plots.plot_scores(scores, estimates, controllers, folder / "scores.png")

@@ -23,7 +23,7 @@ from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.lib.seeds import SEEDS
-from benchmarks.loop.measures import Agent, IdleValve, Trajectory, make_plants, rollout
+from benchmarks.loop.runs import Agent, IdleValve, Trajectory, make_plants, simulate
 from mptc_gym.plant.parameters import INTERFACE
 
 # Ratio of the closed-loop time constant of Dahlin's controller to the plant's time constant.
@@ -137,7 +137,7 @@ class ControllerSpec:
             of run i with the seed `seed + i`.
         """
         agent, arguments = self.start(plant, runs, seed)
-        return rollout(make_plants(runs, samples, **arguments), agent, samples, seed)
+        return simulate(make_plants(runs, samples, **arguments), agent, samples, seed)
 
     def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
         """Return a controller for `runs` runs, trained on `plant` if the controller learns.
@@ -148,7 +148,7 @@ class ControllerSpec:
         agent, arguments = self.start(plant, runs, seed)
         if self.learns:
             plants = make_plants(runs, LEARNING, **{**arguments, "setpoint": "square"})
-            rollout(plants, agent, LEARNING, COMMISSIONING_SEED)
+            simulate(plants, agent, LEARNING, COMMISSIONING_SEED)
         return agent
 
 

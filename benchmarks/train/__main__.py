@@ -84,7 +84,7 @@ def show_validation(networks: Mapping[int, PolicyNetwork]) -> None:
     """
     import pandas as pd
 
-    from benchmarks.lib.report import on_screen
+    from benchmarks.lib.sections import on_screen
 
     rows = {}
     for seed, network in networks.items():

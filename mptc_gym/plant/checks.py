@@ -152,7 +152,7 @@ samples = partial(count, minimum=0)
 duration = partial(count, minimum=1)  # in samples
 
 
-def numbers(name: str, value: Any) -> tuple[float, ...]:
+def number_list(name: str, value: Any) -> tuple[float, ...]:
     """Return a list or tuple of one or more numbers as floats; ValueError for others."""
     if not isinstance(value, list | tuple) or not value:
         reject(name, value, "a list of one or more numbers")
@@ -161,7 +161,7 @@ def numbers(name: str, value: Any) -> tuple[float, ...]:
 
 def polynomial(name: str, value: Any) -> tuple[float, ...]:
     """Return a polynomial's coefficients as floats; ValueError unless the first one is 1."""
-    coefficients = numbers(name, value)
+    coefficients = number_list(name, value)
     if coefficients[0] != 1.0:
         reject(name, value, "a list of numbers, the first of them 1")
     return coefficients
@@ -187,7 +187,7 @@ def setpoint(name: str, value: Any) -> str | float | tuple[float, ...]:
     if isinstance(value, str):
         return str(one_of(name, value, SETPOINTS))
     if isinstance(value, list | tuple):
-        return numbers(name, value)
+        return number_list(name, value)
     return number(name, value)
 
 

@@ -141,7 +141,7 @@ class Parameters(PlantNumbers[Number]):
     )
     b: Sequence[float] = _argument(
         (-0.04560, -0.00404),
-        checks.numbers,
+        checks.number_list,
         "degC per t/h",
         "coefficients of B in equation (28), from z^-1 on",
     )

@@ -1,4 +1,4 @@
-"""Write the report of a command as a Markdown file, and print the tables of the report."""
+"""Write the sections of a report to a Markdown file, or print them on the terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run controllers in scenarios, and compute the least possible errors.
+"""Run a controller in one case, or compute the least possible error of the case.
 
 A scenario is a plant, a set point and a length of the runs. The error of a run is the mean of
 |e|, the absolute error, over the samples of the run. The functions of this module run in worker
@@ -18,7 +18,8 @@ from benchmarks.bounds.least import LeastPossible, least_possible
 from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.statistics import percentiles
 from benchmarks.loop.linear import LinearController, LinearLoop, nominal
-from benchmarks.loop.measures import Trajectory, is_random, measure, rollout_together
+from benchmarks.loop.measures import measure
+from benchmarks.loop.runs import Trajectory, is_random, simulate_together
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym.evaluation import EPISODES
 
@@ -79,7 +80,7 @@ def run_case(scenario: Scenario, controller: ControllerSpec, runs: int, seed: in
     # controller may need different arguments of the environment, and so several batches.
     for arguments, neighbours in itertools.groupby(members, key=operator.itemgetter(1)):
         agents = [agent for agent, _ in neighbours]
-        trajectories += rollout_together(
+        trajectories += simulate_together(
             agents, simulated_runs, scenario.samples, seed, **arguments
         )
     tables = []
