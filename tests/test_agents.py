@@ -218,6 +218,18 @@ class TestDirectNN:
             changed.append(not are_equal(nn.weights, before))
         assert np.flatnonzero(changed).tolist() == [0, 3, 6, 7]  # and not 10
 
+    def test_commands_keep_to_a_share_of_the_actuators_range(self):
+        # A threshold of this size saturates the output node at 0, or at 1.
+        for share, lowest, highest in ((1.0, -10.0, 20.0), (0.9, -8.5, 18.5)):
+            nn = DirectNNController(u_min=-10.0, u_max=20.0, output_share=share, num_envs=2)
+            weights = nn.weights
+            weights.theta_2[:] = -1e6, 1e6
+            nn.weights = weights
+            nn.act(np.ones((2, 6)))
+            assert nn.command == pytest.approx([lowest, highest])
+        # The limits stay the actuator's.
+        evaluate(nn, episodes=2, u_max=20.0)
+
     def test_extreme_inputs_do_not_overflow(self):
         batch = DirectNNController(input_scale=1e6, num_envs=2)
         assert np.isfinite(batch.act([[-1e3] * 6, [1e3] * 6])).all()
