@@ -51,7 +51,6 @@ NOTES = (
 WITH_THE_SAME_GAINS = {
     "nn": ["nn"],
     "pi": ["pi", "pi-searched", "pi-simc"],
-    "dahlin": ["dahlin"],
 }
 PAPER_NOISE = PRESETS["noisy"]["noise_variance"]  # noise variance R of the paper, degC^2
 # Arguments of the environment for a plant without noise and load disturbance.

@@ -27,7 +27,7 @@ SHORT = {  # words that shorten a command, by its module or file
     "bounds": "--preset paper --mpc 2 --jobs 1",
     "claims": "--runs 20 --jobs 1",
     "compare": "--runs 2 --jobs 1",
-    "datasets": "--episodes 2",
+    "offline": "--episodes 2",
     "recurrent": "2 4",  # steps and plants of the training
     "sb3.py": "--steps 1000",
     "speed": "--rounds 1",

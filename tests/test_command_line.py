@@ -71,7 +71,6 @@ REFUSED = {
         (["--agent", "mine"], "must have the form NAME=MODULE:FACTORY"),
         (["--agent", "mine=nowhere:PI"], "'nowhere' is no module in the current folder"),
     ],
-    "datasets": [(["middlepoint/paper/ppo-v0"], 'Choose from: "middle')],
     "tune": [
         (["pi", "--set", "b=[0.1,-0.1]"], "a search for gains needs a stable plant"),
     ],

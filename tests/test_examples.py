@@ -15,9 +15,12 @@ from scipy import signal
 from stable_baselines3 import PPO
 
 import mptc_gym.sb3
+from agents import PolicyNetwork
+from agents.networks import PRETRAINED
 from benchmarks.examples import fit_plant, recurrent
+from benchmarks.lib.seeds import SEEDS
 from mptc_gym import MiddlePointEnv, evaluate
-from tests.conftest import ROOT
+from tests.conftest import ROOT, run
 
 
 def test_a_recurrent_policy_learns_and_enters_the_comparison(tmp_path, monkeypatch):
@@ -64,6 +67,33 @@ def test_the_notebook_runs_and_shows_what_it_showed(capsys, monkeypatch):
         assert printed[:4] == "".join(stored).splitlines()[:4]  # the lines before any training
     assert printed[4].startswith("PPO")
     plt.close("all")
+
+
+def test_a_data_set_is_replayed_and_scores_a_policy(tmp_path, monkeypatch, capsys):
+    minari = pytest.importorskip("minari", reason="Minari needs Python 3.11")
+    from benchmarks.examples import offline
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    offline.main("ppo-hard", "fouling", episodes=2)  # whose actions change the flow
+    dataset = minari.load_dataset("middlepoint/fouling/ppo-hard-v0")
+    assert (dataset.total_episodes, dataset.total_steps) == (2, 2400)
+    env = dataset.recover_environment()
+    metadata = dataset.storage.get_episode_metadata(range(2))
+    for episode, of_episode in zip(dataset, metadata, strict=True):
+        assert of_episode["seed"] in SEEDS["data sets"]
+        again = run(env, episode.actions[:-1], of_episode["seed"])  # the last ends the episode
+        assert np.array_equal(again["observation"], episode.observations[:-1])
+        assert np.array_equal(again["reward"], episode.rewards[:-1])
+        assert np.array_equal(again["applied"], episode.infos["applied"][:-1])
+        assert (episode.terminations.sum(), *episode.truncations.nonzero()[0]) == (0, 1199)
+    error = -np.mean([episode.rewards for episode in dataset])
+    assert f"mean error {error:.3f} (least possible 1.1" in capsys.readouterr().out
+    # Minari and `evaluate` give a policy the same score.
+    network = PolicyNetwork.load(PRETRAINED / "ppo-hard-10000.npz")
+    evaluation = evaluate(network, dataset.env_spec)
+    score = minari.get_normalized_score(dataset, -1200.0 * evaluation.mean_error)
+    assert score == pytest.approx(evaluation.score, abs=1e-12)
+    assert not {*SEEDS["data sets"]} & {*evaluation.seeds}
 
 
 def bump_test(flow_before=0.0):

@@ -5,9 +5,8 @@ import json
 
 import pytest
 
-from benchmarks import datasets, tune
+from benchmarks import tune
 from benchmarks.claims.runs import Batch
-from benchmarks.controllers import roster
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.train import __main__ as train
 from mptc_gym import evaluation
@@ -33,11 +32,10 @@ def test_every_command_stays_in_its_block():
         "studies": [Batch(1000).seed + 1000 - 1],
         "networks": [train.SEED, train.SEED + 5 - 1],
         "sampler": [tune.SEED, tune.SEED + 800 - 1],
-        "preparation": [*trials, trials[-1] + 100 - 1, roster.COMMISSIONING_SEED + 1000 - 1],
+        "preparation": [*trials, trials[-1] + 100 - 1],
         "finals": [*finals, finals[-1] + tune.FINAL_RUNS - 1],
         "validation": [evaluation.VALIDATION_SEED],
         "published": [evaluation.SEED, evaluation.SEED + 1000 - 1],
-        "data sets": [datasets.SEED, datasets.SEED + datasets.EPISODES - 1],
     }.items():
         assert {block_of(seed) for seed in seeds} == {name}
 

@@ -22,7 +22,6 @@ from agents.networks import PRETRAINED
 from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
-from benchmarks.lib.seeds import SEEDS
 from benchmarks.loop.runs import Agent, IdleValve, Trajectory, make_plants, simulate
 from mptc_gym.plant.parameters import INTERFACE
 
@@ -30,8 +29,6 @@ from mptc_gym.plant.parameters import INTERFACE
 # The small ratio makes the control loop fast; the filter time constant makes the control loop
 # robust.
 LAMBDA = 0.1
-LEARNING = 1200  # samples of the square wave in which a controller learns before it is measured
-COMMISSIONING_SEED = SEEDS["preparation"].start  # of the episodes in which a controller learns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,8 +64,6 @@ class ControllerSpec:
         fits plants of both signs.
     random : bool
         Whether the controller draws random numbers, such as initial weights.
-    learns : bool
-        Whether the controller goes on learning from one run to the next.
     compared : bool
         Whether the command `compare` runs the controller by default.
     """
@@ -83,7 +78,6 @@ class ControllerSpec:
     trainings: Sequence[str] = ()
     direction: int | None = None
     random: bool = False
-    learns: bool = False
     compared: bool = True
 
     def members(self) -> "list[ControllerSpec]":
@@ -139,18 +133,6 @@ class ControllerSpec:
         agent, arguments = self.start(plant, runs, seed)
         return simulate(make_plants(runs, samples, **arguments), agent, samples, seed)
 
-    def in_service(self, plant: Mapping[str, Any], runs: int, seed: int) -> Agent:
-        """Return a controller for `runs` runs, trained on `plant` if the controller learns.
-
-        A controller that learns is first run on `plant` for `LEARNING` samples of the square
-        wave.
-        """
-        agent, arguments = self.start(plant, runs, seed)
-        if self.learns:
-            plants = make_plants(runs, LEARNING, **{**arguments, "setpoint": "square"})
-            simulate(plants, agent, LEARNING, COMMISSIONING_SEED)
-        return agent
-
 
 def idle(plant: KnownPlant, runs: int, seed: int) -> Agent:
     """Return a controller that keeps the flow at 0 t/h."""
@@ -194,33 +176,19 @@ def smith(plant: KnownPlant, runs: int, seed: int) -> Agent:
     return plant.robust(predictor)
 
 
-def dahlin(
-    plant: KnownPlant,
-    runs: int,
-    seed: int,
-    closed_loop_time_constant: float | None = None,
-    filter_time_constant: float | None = None,
-) -> Agent:
-    """Return Dahlin's controller, which knows a step test, the dead zone and the limits.
-
-    `closed_loop_time_constant`, s, is by default `LAMBDA` times the time constant of the plant,
-    and `filter_time_constant`, s, is by default chosen for robustness.
-    """
-    if closed_loop_time_constant is None:
-        closed_loop_time_constant = LAMBDA * plant.step_test["time_constant"]
+def dahlin(plant: KnownPlant, runs: int, seed: int) -> Agent:
+    """Return Dahlin's controller, which knows a step test, the dead zone and the limits."""
 
     def controller(filter_time_constant: float) -> DahlinController:
         return DahlinController(
-            closed_loop_time_constant=closed_loop_time_constant,
+            closed_loop_time_constant=LAMBDA * plant.step_test["time_constant"],
             filter_time_constant=filter_time_constant,
             dead_zone=plant.dead_zone,
             **plant.step_test,
             **plant.limits,
         )
 
-    if filter_time_constant is None:
-        return plant.robust(controller)
-    return controller(filter_time_constant)
+    return plant.robust(controller)
 
 
 def self_tuning(plant: KnownPlant, runs: int, seed: int) -> Agent:
@@ -286,7 +254,6 @@ _SPECS = (
         searched="25 weights in the run itself; 6 settings by the search of version 0.1; the "
         "present search takes 800 trials: 566 M samples, 6 min",
         random=True,
-        learns=True,
     ),
     ControllerSpec(
         name="pi",

@@ -42,22 +42,6 @@ def nn_spans(plant: KnownPlant) -> Spans:
     }
 
 
-def dahlin_spans(plant: KnownPlant) -> Spans:
-    """Return the intervals for the time constants of Dahlin's controller.
-
-    The interval for the closed-loop time constant, s, is proportional to the time constant of
-    `plant`. The interval for the filter time constant, s, is proportional to the sum of the
-    time constant and the delay of `plant`.
-    """
-    interval = plant.parameters.sampling_interval
-    seconds = time_constant(plant) * interval
-    response_time = seconds + (plant.model.numbers.delay + 1.0) * interval
-    return {
-        "closed_loop_time_constant": (0.02 * seconds, seconds),
-        "filter_time_constant": (0.02 * response_time, 2.0 * response_time),
-    }
-
-
 def time_constant(plant: KnownPlant) -> float:
     """Return the time constant of the slowest pole of a plant, samples."""
     return -1.0 / math.log(plant.model.slowest_pole)
@@ -67,7 +51,6 @@ def time_constant(plant: KnownPlant) -> float:
 SPANS: dict[str, Callable[[KnownPlant], Spans]] = {
     "nn": nn_spans,
     "pi": pi_spans,
-    "dahlin": dahlin_spans,
 }
 
 

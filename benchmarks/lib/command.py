@@ -29,7 +29,7 @@ Declared = TypeVar("Declared")  # a dataclass whose fields are options of a comm
 options: Callable[[type[Declared]], type[Declared]] = Parameter(name="*")
 
 # The extra of this project that installs a package, for packages that are not in `bench`.
-EXTRAS = {"minari": "data", "ray": "ray"}
+EXTRAS = {"ray": "ray"}
 
 # Types of options.
 Count = PositiveInt

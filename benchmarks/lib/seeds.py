@@ -15,7 +15,7 @@ SEEDS = {
     "networks": range(10_000, 11_000),
     # Gains that a search tries.
     "sampler": range(1_000_000, 1_100_000),
-    # Trials of a search, and runs in which a controller learns before.
+    # Trials of a search.
     "preparation": range(3_000_000, 3_500_000),
     # Runs that choose among the best trials of a search.
     "finals": range(4_000_000, 4_500_000),
