@@ -41,10 +41,11 @@ Array = NDArray[np.float64]
 
 # Number of equally probable magnitudes of the noise from which the slope g is computed.
 NOISE_MAGNITUDES = 8
-# Largest steady-state gain, degC per t/h, in place of an integrating plant's infinite gain.
-LARGEST_GAIN = 1e9
-# Least divisor, degC. Without it, a divisor could be 0 or negative if the limits of the flow
-# exclude 0 t/h.
+# Farthest steady temperature, in amplitudes of the set point, in place of infinite ones of an
+# integrating plant.
+FARTHEST = 1e9
+# Least divisor, in amplitudes of the set point. Without it, a divisor could be 0 or negative if
+# the limits of the flow exclude 0 t/h.
 SMALLEST_RANGE = 1e-9
 # Share of the way to the farthest steady temperature that an output has made after four time
 # constants. An output that cannot reach a level counts as having arrived after this share.
@@ -83,7 +84,7 @@ class SetPointLaw:
         # A constant flow can keep every temperature from -reachable to reachable, degC.
         # `_reachable` is negative if the limits exclude a flow of 0 t/h.
         low, high = model.limits
-        gain = min(float(np.abs(at_start.gain)), LARGEST_GAIN)
+        gain = min(float(np.abs(at_start.gain)), FARTHEST * self._amplitude / (high - low))
         self._reachable = gain * min(-low, high)
         # Noise makes the sign of a small error uncertain. Equally probable magnitudes of the
         # noise, degC, are quantiles of the magnitude of a normal random number.
@@ -101,8 +102,8 @@ class SetPointLaw:
         # Age of a level at which the output counts as having arrived at the level, after every
         # change of the set point. The largest change is from -amplitude to amplitude, on the
         # way from -amplitude to `_reachable`.
-        largest_way = max(self._reachable + self._amplitude, SMALLEST_RANGE)
-        largest_share = 2.0 * self._amplitude / largest_way
+        largest_way = self._reachable / self._amplitude + 1.0  # in amplitudes
+        largest_share = 2.0 / max(largest_way, SMALLEST_RANGE)
         self._arrival_age = int(np.searchsorted(self._progress, min(largest_share, ARRIVED)))
         # Probability that a level of the set point lasts longer than an age, by age.
         length_count = self._longest - self._shortest + 1

@@ -23,9 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.linear_program import (
     LOOKAHEAD,
-    TRAVEL_PRICE,
     NoBoundError,
     plan,
+    price_of_travel,
     reference,
 )
 from benchmarks.bounds.unknown import error_bounds
@@ -34,7 +34,7 @@ from benchmarks.loop.linear import LinearModel
 from benchmarks.loop.runs import IdleValve, drawn_numbers, is_random, make_plants, simulate
 from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
-from mptc_gym.plant.parameters import PlantNumbers
+from mptc_gym.plant.parameters import ARGUMENTS, PlantNumbers
 from mptc_gym.plant.sampling import plant_numbers
 
 Array = NDArray[np.float64]
@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 # points; "causal": a lower bound for controllers that do not know future set points;
 # "reference": the least error of a controller that expects no change of the set point.
 KINDS = "preview", "causal", "reference"
+DEFAULTS = Parameters()
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class LeastPossible(Estimate):
             If the error of an idle valve is not above the least possible error.
         """
         idle = self.idle.value
-        if idle - self.value <= 1e-9 * max(idle, 1.0):
+        if idle - self.value <= 1e-9 * idle:
             raise ValueError(
                 f"a score needs an idle-valve error above the least possible error of "
                 f"{self.value:g} °C, got {idle:g} °C"
@@ -184,6 +185,7 @@ def _bound(
     """
     if not is_random(parameters):
         episodes = 1
+    parameters, unit = in_standard_units(parameters)
     sampled = _episodes_of(parameters, samples, episodes, seed)
     different_bounds = episodes
     if not (parameters.ranges or parameters.setpoint == "random"):
@@ -192,10 +194,37 @@ def _bound(
     for i in range(different_bounds):
         error_sum = _error_sum(parameters, kind, sampled.numbers[i], sampled.setpoints[i])
         # Solvers differ between machines in later digits.
-        values.append(round(error_sum / samples, 6))
+        values.append(unit * round(error_sum / samples, 6))
     mean = student(values)
-    idle = student(sampled.idle_errors)
+    idle = student(unit * sampled.idle_errors)
     return LeastPossible(**vars(mean), kind=kind, idle=idle, episodes=tuple(values))
+
+
+def in_standard_units(parameters: Parameters) -> tuple[Parameters, float]:
+    """Return the same plant in units in which the numbers are as large as the paper's.
+
+    Linear programs, whose solvers have absolute tolerances, are then as exact for a plant in
+    kg/h and thousandths of a degree as for the paper's plant. In the returned arguments, the
+    largest set point and the range of the flow have the magnitudes of the default arguments, 5
+    and 20. The returned number is the returned unit of temperature, degC. If the set point is
+    always 0, the unit of temperature stays 1 degC.
+    """
+    temperature = parameters.largest_setpoint / DEFAULTS.largest_setpoint or 1.0
+    limits = parameters.lowest
+    default_limits = DEFAULTS.lowest
+    flow = (limits.u_max - limits.u_min) / (default_limits.u_max - default_limits.u_min)
+    sizes = {
+        "degC": temperature,
+        "t/h": flow,
+        "degC per t/h": temperature / flow,
+        "degC^2": temperature**2,
+    }
+    arguments = asdict(parameters)
+    for name, argument in ARGUMENTS.items():
+        size = sizes.get(argument.metadata["unit"])
+        if size and not isinstance(arguments[name], str):
+            arguments[name] = (np.asarray(arguments[name]) / size).tolist()
+    return Parameters(**arguments), temperature
 
 
 def _error_sum(
@@ -218,7 +247,8 @@ def _error_sum(
     bounds = error_bounds(model)
     if kind == "reference":
         errors, flow = reference(model, bounds, setpoint)
-        costs = TRAVEL_PRICE * np.abs(np.diff(flow, prepend=0.0))
+        travel = np.abs(np.diff(flow, prepend=0.0))
+        costs = price_of_travel(model, setpoint) * travel
     else:
         penalty = np.zeros(len(setpoint))
         if kind == "causal" and parameters.setpoint_amplitude > 0.0:

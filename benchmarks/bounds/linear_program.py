@@ -24,10 +24,11 @@ SETTLED_FLOW_RANGE = 0.05
 # addition to the lag. With more samples, the references of the presets would be the same.
 LOOKAHEAD = 60
 # Two small prices that select one of several plans with equal errors. With `SMALLEST_SLOPE`,
-# the least slope of an error bound, a plan ends at the set point. With `TRAVEL_PRICE`, degC per
-# t/h of valve travel, the valve moves no more than needed.
+# the least slope of an error bound, a plan ends at the set point. With `TRAVEL_PRICE`, the
+# valve moves no more than needed: a move through the whole range of the flow costs as much as
+# an error of this share of the largest set point.
 SMALLEST_SLOPE = 0.001
-TRAVEL_PRICE = 1e-4
+TRAVEL_PRICE = 4e-4
 
 
 class NoBoundError(ValueError):
@@ -120,7 +121,7 @@ def plan(
     setpoint: Array,
     *,
     past: ArrayLike = (),
-    quiet: bool = False,
+    travel_price: float = 0.0,
     penalty: ArrayLike = 0.0,
 ) -> Plan:
     """Return the flows for which the sum of the lower bounds of the mean errors is least.
@@ -157,8 +158,9 @@ def plan(
         Set points y_d(k), degC, shape (samples,).
     past
         Flows at the samples k = 0, 1, ... that the plan must not change, t/h, shape (count,).
-    quiet
-        Whether to choose, among plans with equal errors, the plan with the least valve travel.
+    travel_price
+        Price of valve travel, degC per t/h. A small price chooses, among plans with equal
+        errors, the plan with the least valve travel.
     penalty
         Price of the flow u_a(k), degC per t/h, shape (samples,), or one price for all samples.
 
@@ -175,7 +177,9 @@ def plan(
     if past_count < samples - 1:
         error_without_plan = setpoint - scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
         price = np.broadcast_to(np.asarray(penalty, float), samples)
-        program = _program(model, bounds, error_without_plan, flow[:past_count], quiet, price)
+        program = _program(
+            model, bounds, error_without_plan, flow[:past_count], travel_price, price
+        )
         chosen = samples - 1 - past_count  # number of flows
         # The variables of the program are `chosen` outputs, `chosen` flows, and others.
         flow[past_count:-1] = _solve(program)[chosen : 2 * chosen]
@@ -190,7 +194,7 @@ def _program(
     bounds: ErrorBounds,
     error_without_plan: Array,
     past: Array,
-    quiet: bool,
+    travel_price: float,
     price: Array,
 ) -> dict[str, Any]:
     """Return the linear program that chooses the n flows between past flows and last flow.
@@ -201,17 +205,17 @@ def _program(
     - the n flows u, t/h;
     - pieces of the expected errors, degC: n positive and n negative pieces for each slope of
       the lower bound of the mean error;
-    - if `quiet` is true, n upward and n downward moves of the valve, t/h.
+    - if valve travel has a price, n upward and n downward moves of the valve, t/h.
 
     The equations are A y = B u, where A and B are the plant's matrices in equation (28) of the
     paper; y plus the positive pieces minus the negative pieces equals the error without the n
-    flows; and, if `quiet` is true, each flow minus the previous flow equals the upward minus
-    the downward move. With outputs among the variables, the linear program is sparse, so that
-    solvers are fast even if the plant is slow.
+    flows; and, if valve travel has a price, each flow minus the previous flow equals the upward
+    minus the downward move. With outputs among the variables, the linear program is sparse, so
+    that solvers are fast even if the plant is slow.
 
     Parameters
     ----------
-    model, bounds, quiet
+    model, bounds, travel_price
         Arguments of `plan`.
     error_without_plan
         Expected errors if all flows after the past flows are 0, degC, shape (samples,).
@@ -227,9 +231,9 @@ def _program(
     A, B = equations(model, samples)
     eye = scipy.sparse.eye_array(n)
     slopes = bounds.slopes
-    if quiet:
-        # A line may have the slope 0 near an error of 0, but a quiet plan needs a slope above 0
-        # to end at the set point.
+    if travel_price:
+        # A line may have the slope 0 near an error of 0, but a plan with little travel needs a
+        # slope above 0 to end at the set point.
         slopes = np.maximum(slopes, SMALLEST_SLOPE)
     signs = scipy.sparse.hstack([eye, -eye] * len(slopes))
     blocks = [[A[first:, first:], -B[first:, count:-1], None], [eye, None, signs]]
@@ -239,14 +243,14 @@ def _program(
     costs = [np.zeros(n), price[count:-1], np.repeat(slopes, 2 * n)]
     low = [np.full(n, -np.inf), np.full(n, model.limits[0]), np.zeros(len(lengths))]
     high = [np.full(n, np.inf), np.full(n, model.limits[1]), lengths]
-    if quiet:
+    if travel_price:
         differences = eye - scipy.sparse.eye_array(n, k=-1)  # flow k minus flow k - 1
         moves = scipy.sparse.hstack([-eye, eye])
         blocks = [[*row, None] for row in blocks]
         blocks.append([None, differences, None, moves])
         last_flow = past[-1] if count else 0.0
         right.append(np.append(last_flow, np.zeros(n - 1)))
-        costs.append(np.full(2 * n, TRAVEL_PRICE))
+        costs.append(np.full(2 * n, travel_price))
         low.append(np.zeros(2 * n))
         high.append(np.full(2 * n, np.inf))
     return {
@@ -274,6 +278,12 @@ def _solve(program: dict[str, Any]) -> Array:
         f"scipy.optimize.linprog did not solve the linear program with {len(program['c'])} "
         f"variables in {len(SOLVERS)} attempts: {solution.message}"
     )
+
+
+def price_of_travel(model: LinearModel, setpoint: Array) -> float:
+    """Return the price of valve travel in the plan of a reference, degC per t/h."""
+    low, high = model.limits
+    return TRAVEL_PRICE * float(np.abs(setpoint).max()) / (high - low)
 
 
 def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
@@ -304,6 +314,7 @@ def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
         If no solver solves a linear program within `TIME_LIMIT` seconds.
     """
     low, high = model.limits
+    travel_price = price_of_travel(model, setpoint)
     flow = np.zeros(0)
     errors = np.zeros(len(setpoint))
     for start, stop in held(setpoint):
@@ -312,7 +323,8 @@ def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
         if not is_last:
             beyond = np.full(model.lag + LOOKAHEAD, setpoint[start])
             expected_setpoint = np.concatenate([expected_setpoint, beyond])
-        planned = plan(model, bounds, expected_setpoint, past=flow[:start], quiet=True)
+        past = flow[:start]
+        planned = plan(model, bounds, expected_setpoint, past=past, travel_price=travel_price)
         flow = planned.flow
         errors[start:stop] = planned.errors[start:stop]
         # The range of the last lag + 1 flows before the change, t/h: the plant has settled if

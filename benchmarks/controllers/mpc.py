@@ -23,9 +23,12 @@ Array = NDArray[np.float64]
 
 HORIZON = 5  # number of flows in a plan, one for each sample
 MOST_SWEEPS = 100  # largest number of sweeps of coordinate descent per sample
-TOLERANCE = 1e-4  # t/h; coordinate descent stops if a sweep changes no flow by this much
-SMALL_VARIANCE = 1e-9  # degC^2; added to the noise variance, which may be 0
-SMALL_DEVIATION = 1e-9  # degC; least standard deviation of a forecast error, in place of 0
+# Coordinate descent stops if a sweep changes no flow by this share of the range of the flow.
+TOLERANCE = 5e-6
+# Numbers in place of 0, divided by the largest set point or its square: added to the variance
+# of the noise, and the least standard deviation of a forecast error.
+SMALL_VARIANCE = 1e-9 / 5.0**2
+SMALL_DEVIATION = 1e-9 / 5.0
 SMALLEST_CURVATURE = np.finfo(np.float64).tiny  # degC^2 per (t/h)^2; a divisor in place of 0
 WARM_UP = 200  # number of samples after which the Kalman filter's covariance hardly changes
 
@@ -139,7 +142,8 @@ class PredictiveController:
         level_variance = np.square(self._numbers.disturbance_amplitude) / 3.0
         jump_variance = level_variance * (1.0 - np.square(self._no_jump_probability))
         walk_variance = LOAD_INTERVAL * self._numbers.disturbance_walk_variance
-        noise_variance = self._numbers.noise_variance + SMALL_VARIANCE
+        scale = parameters.largest_setpoint or parameters.temperature_span  # degC
+        noise_variance = self._numbers.noise_variance + SMALL_VARIANCE * scale**2
         # The variances of v(k) in `LinearModel.state_space_with_load`, degC^2, shape (runs, 3).
         self._variances = np.stack([noise_variance, jump_variance, walk_variance], axis=1)
         # Flow i of a plan affects the output y(k + 1 + delay + i) at the earliest. This output
@@ -162,7 +166,7 @@ class PredictiveController:
         if levels.random and levels.amplitude > 0.0:
             self._random = RandomSetpoint(levels.shortest, levels.longest, levels.amplitude)
             deviation = self._forecast_deviation()
-            self._deviation = np.maximum(deviation, SMALL_DEVIATION)
+            self._deviation = np.maximum(deviation, SMALL_DEVIATION * scale)
         self.reset()
 
     def reset(self) -> None:
@@ -373,6 +377,8 @@ class PredictiveController:
         for each run of the batch. `slopes` has the negative derivative of the cost by each
         planned flow, at a plan of zeros, as in `_Model.cost`.
         """
+        limits = self._parameters.lowest  # The limits are the same in all runs.
+        smallest_change = TOLERANCE * (limits.u_max - limits.u_min)
         plan = start.copy()
         free_flows = range(HORIZON)
         if first_flow is not None:
@@ -386,6 +392,6 @@ class PredictiveController:
                 best = plan[i] - derivative / model.curvature[i]
                 np.maximum(best, self._numbers.u_min, out=best)
                 np.minimum(best, self._numbers.u_max, out=plan[i])
-            if np.abs(plan - before).max() < TOLERANCE:
+            if np.abs(plan - before).max() < smallest_change:
                 break
         return plan

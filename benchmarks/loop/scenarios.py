@@ -153,20 +153,22 @@ class PlantOptions:
     def cases(self, default: Mapping[str, Scenario]) -> Mapping[str, Scenario]:
         """Return the cases of the chosen plant by name, or `default` if no plant is chosen.
 
-        The cases of a chosen plant are "square" and "constant", with the set points in
-        `SETPOINTS`. If the arguments of the chosen plant define a set point, the only case is
-        "run", with this set point.
+        The cases of a chosen plant are "square" and "constant", as in `SETPOINTS`, but with the
+        amplitude and the period of the plant's arguments. If the arguments of the chosen plant
+        have a `setpoint`, the only case is "run", with this set point.
         """
         arguments = self.arguments()
         if not self.name:
             return default
         cases: tuple[Scenario, ...] = SETPOINTS
-        if {"setpoint", "setpoint_amplitude", "setpoint_period"} & set(arguments):
+        if "setpoint" in arguments:
             cases = (Scenario("run", "the set point of the plant's arguments", 1200, {}),)
         cases_by_name = {}
         for case in cases:
             title = f"{case.title}, {self.name}"
-            combined = {**arguments, **case.arguments}
+            combined = dict(arguments)
+            if case.name == "constant":
+                combined["setpoint"] = Parameters(**arguments).setpoint_amplitude
             cases_by_name[case.name] = replace(case, title=title, arguments=combined)
         return cases_by_name
 

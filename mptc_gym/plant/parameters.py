@@ -299,6 +299,13 @@ class Parameters(PlantNumbers[Number]):
         return PlantNumbers(**{name: self.range_of(name)[0] for name in PLANT_NUMBERS})
 
     @cached_property
+    def largest_setpoint(self) -> float:
+        """Largest magnitude that the set point can have, degC."""
+        if isinstance(self.setpoint, str):
+            return self.setpoint_amplitude
+        return float(np.abs(self.setpoint).max())
+
+    @cached_property
     def is_disturbed(self) -> bool:
         """Whether the plant can have a load disturbance other than 0."""
         return self._can_differ(0.0, "disturbance_amplitude", "disturbance_walk_variance")
