@@ -292,7 +292,9 @@ def test_frames_are_stacked_in_the_order_of_the_training():
     made = evaluate(
         model, lambda: VecFrameStack(trained(VecNormalize(dummy())), 2), episodes=EPISODES
     )
-    np.testing.assert_array_equal(evaluation.errors, made.errors)
+    # The batches have 3 and 2 plants, for which float32 products round differently.
+    largest = made.errors.max()
+    np.testing.assert_allclose(evaluation.errors, made.errors, rtol=0, atol=1e-6 * largest)
 
 
 def test_a_plain_model_from_a_file_needs_no_environments(tmp_path):
