@@ -12,10 +12,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import torch
 from gymnasium.envs.registration import EnvSpec
-from stable_baselines3.common.callbacks import BaseCallback
-from torch.nn.utils import parameters_to_vector
+from gymnasium.error import DependencyNotInstalled
+
+try:
+    from stable_baselines3.common.callbacks import BaseCallback
+except ImportError as error:
+    raise DependencyNotInstalled(
+        'mptc_gym.sb3 needs Stable-Baselines3: pip install "mptc_gym[sb3]"'
+    ) from error
 
 from mptc_gym.evaluation import VALIDATION_SEED, Evaluation, evaluate
 from mptc_gym.sb3_vec_env import GymnasiumVecEnv, like, make_vec_env
@@ -42,7 +47,8 @@ class ScoreCallback(BaseCallback):
         Id or `EnvSpec` of the environment in which the policy is scored.
     every
         Least number of training samples between two scores, summed over all plants. The policy
-        is also scored after its last update. The same weights are never scored twice.
+        is also scored after its last update. Without an update in between, the policy is not
+        scored again.
     episodes
         Number of episodes in which the policy is scored each time. If plants or set points are
         random, a score needs least possible errors, which are known for at most 200 episodes.
@@ -81,7 +87,7 @@ class ScoreCallback(BaseCallback):
         self.arguments = arguments
         self.scores: list[tuple[int, Evaluation]] = []
         self.best: Evaluation | None = None
-        self._scored_weights = torch.empty(0)  # of the latest score; none yet
+        self._scored_updates: int | None = None  # updates before the latest score
 
     def _on_training_start(self) -> None:
         """Raise an error before the training, and not after it, if `like` cannot work."""
@@ -100,10 +106,12 @@ class ScoreCallback(BaseCallback):
 
     def _score(self) -> None:
         """Score, log and print the policy, and keep it if it is best, unless already scored."""
-        weights = parameters_to_vector(self.model.policy.parameters()).detach()
-        if torch.equal(weights, self._scored_weights):
+        # All algorithms count their updates, whereas their weights are on any device, and those
+        # of SBX are no tensors.
+        updates = self.model._n_updates
+        if updates == self._scored_updates:
             return
-        self._scored_weights = weights
+        self._scored_updates = updates
         self._next_score = self.num_timesteps + self.every
         result = evaluate(
             self.model,

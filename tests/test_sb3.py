@@ -2,6 +2,7 @@
 
 import csv
 from contextlib import closing
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -176,6 +177,16 @@ class TestScoreCallback:
         callback.every = 1  # many scores in a rollout with the same weights are none
         model.learn(128, callback, reset_num_timesteps=False)
         assert [samples for samples, _ in callback.scores] == [64, 64, 130, 192]
+
+    def test_an_algorithm_without_tensors_is_scored(self, monkeypatch):
+        model = SAC("MlpPolicy", make_vec_env(HARD, 2), **ALGORITHMS[SAC], device="cpu")
+        # As in SBX. The device is all that Stable-Baselines3 asks the parameters for.
+        parameters = [SimpleNamespace(device=torch.device("cpu"))]
+        monkeypatch.setattr(model.policy, "parameters", lambda: iter(parameters))
+        callback = ScoreCallback(HARD, every=16, episodes=2, verbose=0, max_episode_steps=9)
+        model.learn(48, callback)
+        # The last update comes after the last sample.
+        assert [samples for samples, _ in callback.scores] == [16, 32, 48, 48]
 
     def test_errors_come_before_a_training(self):
         model = model_of(make_vec_env(HARD, 2))
