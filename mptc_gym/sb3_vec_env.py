@@ -14,6 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecCheckNan,
@@ -41,7 +42,10 @@ class GymnasiumVecEnv(VecEnv):
     environment after another. `reset` and `step` return bit for bit what a `DummyVecEnv`
     returns for the same environments and seeds in `Monitor` wrappers, except for the infos of
     `step`. To save time, `step` returns an empty info for each environment whose episode has
-    not ended. `env_method` and `set_attr` raise an error.
+    not ended. The info at the end of an episode has the entry "episode" of a `Monitor`, and
+    `env_is_wrapped(Monitor)` is True. So, as for a `DummyVecEnv` of `Monitor` wrappers,
+    Stable-Baselines3 evaluates the rewards of the environments even in a `VecNormalize`, and a
+    `VecMonitor` warns of two monitors. `env_method` and `set_attr` raise an error.
 
     Parameters
     ----------
@@ -155,8 +159,11 @@ class GymnasiumVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[Any], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return False for each environment in `indices`: only the batch may be wrapped."""
-        return [False for _ in self._get_indices(indices)]
+        """Return whether `wrapper_class` is `Monitor`, for each environment in `indices`.
+
+        The single environments have no wrappers, but infos like those of a `Monitor`.
+        """
+        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
 
 def _infos_of_one(infos: Mapping[str, Any], row: int) -> dict[str, Any]:

@@ -12,7 +12,9 @@ from gymnasium.error import Error
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.wrappers import FlattenObservation
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env as monitored_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
@@ -87,9 +89,35 @@ class TestBatch:
         pictured.reset()
         np.testing.assert_array_equal(pictured.get_images(), pictured.batch.render())
         assert [plant.delay for plant in pictured.get_attr("parameters", [1])] == [3]
-        assert pictured.env_is_wrapped(Monitor) == [False, False]
+        assert pictured.env_is_wrapped(VecMonitor) == [False, False]
         with pytest.raises(ValueError, match=r"autoreset_mode 'SameStep', got .*NEXT_STEP"):
             GymnasiumVecEnv(gymnasium.make_vec("MiddlePoint-v0", 2))
+
+
+def rewards_of_evaluations(plants, folder):
+    """Return the mean rewards of a policy, evaluated in both ways of Stable-Baselines3."""
+    plants = VecNormalize(plants, training=False)
+    plants.ret_rms.var = np.array(50.0)  # so that normalised rewards differ from the plant's
+    model = model_of(plants, seed=0)
+    callback = EvalCallback(
+        plants, n_eval_episodes=4, eval_freq=16, log_path=folder, verbose=0, warn=False
+    )
+    model.learn(32, callback)
+    plants.seed(5)
+    reward, _ = evaluate_policy(model, plants, n_eval_episodes=4)
+    with np.load(folder / "evaluations.npz") as evaluations:
+        return [reward, *evaluations["results"].ravel()]
+
+
+def test_evaluations_report_the_rewards_of_the_plants_as_with_monitors(tmp_path):
+    arguments = {"max_episode_steps": 9, "setpoint": [5.0, 3.0]}
+    both = [
+        make_vec_env("MiddlePointNoisy-v0", 2, seed=0, **arguments),
+        monitored_vec_env("MiddlePointNoisy-v0", 2, seed=0, env_kwargs=arguments),
+    ]
+    rewards, expected = (rewards_of_evaluations(plants, tmp_path) for plants in both)
+    assert rewards == pytest.approx(expected, abs=2e-6)  # those of a Monitor are rounded
+    assert max(rewards) < -1.0
 
 
 class Weights(BaseCallback):
@@ -114,8 +142,9 @@ TRAININGS = {
         [lambda: Monitor(gymnasium.make(HARD))] * 2, start_method="fork"),
     "make_vec_env": lambda: make_vec_env(HARD, 2, seed=0, group=2, max_episode_steps=20),
     "VecNormalize": lambda: VecNormalize(make_vec_env(HARD, 2, max_episode_steps=20)),
-    "VecFrameStack": lambda: VecMonitor(VecFrameStack(make_vec_env(HARD, 2), 2)),
-    "wrapper": lambda: DummyVecEnv([lambda: FlattenObservation(gymnasium.make(HARD))] * 2),
+    "VecFrameStack": lambda: VecFrameStack(make_vec_env(HARD, 2), 2),
+    "wrapper": lambda: VecMonitor(
+        DummyVecEnv([lambda: FlattenObservation(gymnasium.make(HARD))] * 2)),
 }  # fmt: skip
 ALGORITHMS = {
     PPO: {"n_steps": 16, "batch_size": 16, "n_epochs": 1},
