@@ -501,6 +501,10 @@ def make_env(**arguments: Any) -> MiddlePointEnv:
     return MiddlePointEnv(**arguments)
 
 
+# From these render modes, `gymnasium.make` derives further ones, such as "rgb_array_list".
+make_env.metadata = MiddlePointEnv.metadata  # type: ignore[attr-defined]
+
+
 def _clip(value: float, limit: float) -> float:
     """Return `value` limited to the range from -`limit` to `limit`; NaN becomes `limit`."""
     return max(-limit, min(limit, value))

@@ -31,7 +31,7 @@ from mptc_gym.plant.parameters import INTERFACE
 from mptc_gym.vector_env import parameters_of
 
 # Wrappers that only record or check: `like` leaves them out.
-_RECORDERS = "Monitor", "RecordEpisodeStatistics", "RecordVideo"
+_RECORDERS = "Monitor", "RecordEpisodeStatistics", "RecordVideo", "RenderCollection"
 _VEC_RECORDERS = VecMonitor, VecVideoRecorder, VecCheckNan
 
 

@@ -262,6 +262,7 @@ TRAININGS = {
     "one": (one, one),
     "windows": (make := partial(one, action_window=3, error_window=0, output_window=2), make),
     "Monitor": (lambda: dummy(lambda: Monitor(one())), one),
+    "pictures": (partial(one, render_mode="rgb_array_list"), one),
     "batch": (partial(batch, action_window=3), partial(one, action_window=3)),
     "changes": (partial(batch, **CHANGE), partial(one, **CHANGE)),
     "processes": (processes, one),

@@ -127,6 +127,19 @@ def test_pictures_stay_and_copies_in_the_middle_of_an_episode_draw_alike():
     np.testing.assert_array_equal(twin.render(), env.render())
 
 
+def test_a_list_has_the_pictures_since_the_latest_call():
+    modes = "rgb_array_list", "rgb_array"
+    collecting, env = (gymnasium.make("MiddlePoint-v0", render_mode=mode) for mode in modes)
+    collecting.reset(seed=0), env.reset(seed=0)
+    for _ in range(2):
+        pictures = []
+        for _ in range(2):
+            collecting.step(UP), env.step(UP)
+            pictures.append(env.render())
+        np.testing.assert_array_equal(collecting.render()[-2:], pictures)
+    assert collecting.render() == []
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_pictures_of_a_batch_are_those_of_one_after_the_other(mode, rng):
     batches = native_and_sync(2, mode, 6, render_mode="rgb_array", **NOISY)
