@@ -350,7 +350,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         self._window[output_index] = 0.0
         self._window[action_index] = rest_action
         if self.render_mode is not None:
-            self._record = Record(numbers, self.parameters.sampling_interval, setpoint)
+            self._record = Record.at_rest(numbers, self.parameters.sampling_interval, setpoint)
         if self.render_mode == "human":
             self.render()
         info = dict.fromkeys(INFO, 0.0)

@@ -16,35 +16,62 @@ class Record:
     A record holds only numbers and no pygame objects, so that an environment can be copied
     together with its record.
 
+    Parameters
+    ----------
+    plant
+        Parameter values of the plant in this episode, such as delay, dead zone and limits.
+    sampling_interval
+        Sampling interval, s.
+    first
+        Sample number of the first sample to be added.
+    span
+        Number of samples between the left edge and the right edge of a picture; by default,
+        `FEWEST_SAMPLES`, or four delays if they are longer.
+
     Attributes
     ----------
-    plant : PlantNumbers
-        Parameter values of the plant in this episode, such as delay, dead zone and limits.
-    sampling_interval : float
-        Sampling interval, s.
-    span : int
-        Number of samples between the left edge and the right edge of a picture.
     infos : deque of dict
         Infos of the latest samples, as many as a picture shows, the newest last.
     k : int
-        Sample number of the newest sample.
+        Sample number of the newest sample; `first` - 1 before the first sample.
     extremes : tuple of float
-        Lowest and highest of 0 and of all set points and temperatures of the episode, degC.
-        With the extremes of the visible samples alone, the axis would change often.
+        Lowest and highest of 0 and of all recorded set points and temperatures, degC. With the
+        extremes of the visible samples alone, the axis would change often.
     """
 
     def __init__(
-        self, plant: PlantNumbers[float], sampling_interval: float, setpoint: float
+        self,
+        plant: PlantNumbers[float],
+        sampling_interval: float,
+        *,
+        first: int = 0,
+        span: int | None = None,
     ) -> None:
-        """Begin the record at sample k = 0, at rest, with the set point `setpoint`, degC."""
         self.plant = plant
         self.sampling_interval = sampling_interval
-        self.span = max(FEWEST_SAMPLES, 4 * int(plant.delay))
+        self.first = first
+        self.span = span or max(FEWEST_SAMPLES, 4 * int(plant.delay))
         self.infos: deque[dict[str, float]] = deque(maxlen=self.span + 1)
-        self.k = -1  # no sample yet
+        self.k = first - 1  # no sample yet
         self.extremes = 0.0, 0.0
+
+    @classmethod
+    def at_rest(
+        cls, plant: PlantNumbers[float], sampling_interval: float, setpoint: float
+    ) -> Record:
+        """Return a record with the sample k = 0, at rest, with the set point `setpoint`, degC.
+
+        The other arguments are those of the class.
+        """
+        record = cls(plant, sampling_interval)
         at_rest = {"output": 0.0, "command": 0.0, "applied": 0.0}
-        self.add({"setpoint": setpoint, "error": setpoint, **at_rest})
+        record.add({"setpoint": setpoint, "error": setpoint, **at_rest})
+        return record
+
+    @property
+    def left(self) -> int:
+        """Sample number at the left edge of a picture, which moves with the newest sample."""
+        return max(self.first, self.k - self.span)
 
     def add(self, info: Mapping[str, float]) -> None:
         """Add the next sample of the episode, by the info that `step` returns."""

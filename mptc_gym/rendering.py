@@ -53,6 +53,8 @@ class Panel:
         Position and size of the panel in the picture, pixels.
     low, high
         Lower end and upper end of the vertical axis, degC or t/h.
+    text_size
+        Size of pygame's font for labels, pixels.
     """
 
     def __init__(
@@ -62,14 +64,15 @@ class Panel:
         rectangle: pygame.Rect,
         low: float,
         high: float,
+        text_size: int = 22,
     ) -> None:
         self._surface = surface
         self._record = record
         self._rectangle = rectangle
         self._low = low
         self._high = high
-        self._first = max(0, record.k - record.span)  # sample number at the left edge
-        self._font = pygame.font.Font(None, 22)
+        self._first = record.left
+        self._font = pygame.font.Font(None, text_size)
         self._draw_axes()
 
     def _point(self, k: float, value: float) -> tuple[int, int]:

@@ -250,7 +250,9 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             interval = self.parameters.sampling_interval
             for place, i in enumerate(which.tolist()):
                 numbers_of_plant = plant_numbers(numbers, place)
-                self._records[i] = Record(numbers_of_plant, interval, setpoint[place].item())
+                self._records[i] = Record.at_rest(
+                    numbers_of_plant, interval, setpoint[place].item()
+                )
 
         infos: dict[str, NDArray[Any]] = {**self._plants.factors}
         new_values = {"setpoint": setpoint, "error": setpoint}

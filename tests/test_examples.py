@@ -11,13 +11,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from PIL import Image, ImageSequence
 from scipy import signal
 from stable_baselines3 import PPO
 
 import mptc_gym.sb3
 from agents import PolicyNetwork
 from agents.networks import PRETRAINED
-from benchmarks.examples import fit_plant, recurrent
+from benchmarks.examples import film, fit_plant, recurrent
 from benchmarks.lib.seeds import SEEDS
 from mptc_gym import MiddlePointEnv, evaluate
 from tests.conftest import ROOT, run
@@ -35,6 +36,22 @@ def test_a_recurrent_policy_learns_and_enters_the_comparison(tmp_path, monkeypat
     policy.reset()
     assert (first == policy.act(observations)).all()  # ... and forgets at a reset.
     assert evaluate(policy, "MiddlePointHard-v0", episodes=2).mean_error > 0.0
+
+
+def test_the_film_ends_with_the_picture_that_it_begins_with(tmp_path, monkeypatch):
+    monkeypatch.setattr(film, "ACTS", {0: "from the start", 60: "later"})
+    monkeypatch.setattr(film, "SAMPLES", 40)
+    monkeypatch.chdir(tmp_path)
+    film.main()
+    with Image.open("film.gif") as moving:
+        pictures = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(moving)]
+    finished, start, _, end_of_act, *_, end = pictures
+    assert len(pictures) == 1 + 2 * 3
+    assert (finished == end).all()
+    left, right = np.s_[:, :470], np.s_[:, 480:]
+    assert (end_of_act[left] == finished[left]).all()
+    assert (start[left] != finished[left]).any()
+    assert (end_of_act[right] != finished[right]).any()
 
 
 def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):
