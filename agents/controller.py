@@ -1,59 +1,23 @@
-"""Define the base classes of all controllers, and check constructor arguments."""
+"""Define the base classes of all controllers."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
-from numbers import Integral, Real
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .actuator import float32_action
+from mptc_gym.plant.actuator import float32_action
+from mptc_gym.plant.checks import nonzero, not_negative, number, positive, reject
+from mptc_gym.plant.parameters import Parameters
 
 # Arguments of the environment for an observation of the latest three set points and the latest
 # three errors: the six inputs of the paper's network.
 PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}
-LARGEST_NUMBER: Final = 1e9  # largest size of a constructor argument, as in the environment
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
-
-
-# Each of the following functions returns the value of a constructor argument, or raises a
-# ValueError with the argument's name, what is allowed and the value.
-
-
-def number(name: str, value: Any, low: float = -LARGEST_NUMBER) -> float:
-    """Return a number from `low` to `LARGEST_NUMBER` as a float."""
-    is_number = isinstance(value, Real) and not isinstance(value, bool)
-    if not (is_number and low <= value <= LARGEST_NUMBER):
-        allowed = f"a number from {low:g} to {LARGEST_NUMBER:g}"
-        raise ValueError(f"{name} must be {allowed}, got {value!r}")
-    return float(value)
-
-
-not_negative = partial(number, low=0.0)
-positive = partial(number, low=1e-9)  # not 0.0, as `number` allows the value `low` itself
-
-
-def nonzero(name: str, value: Any) -> float:
-    """Return a number other than 0 as a float."""
-    if value == 0.0:
-        raise ValueError(f"{name} must not be 0")
-    return number(name, value)
-
-
-def integer(name: str, value: Any, low: int = 0) -> int:
-    """Return an integer of at least `low` as an int."""
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
-    if not (is_integer and value >= low):
-        raise ValueError(f"{name} must be an integer of at least {low}, got {value!r}")
-    return int(value)
-
-
-from_1 = partial(integer, low=1)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -106,7 +70,7 @@ class Controller(ABC):
         """
         self._check(number, "u_min", "u_max")
         if self.u_min >= self.u_max:
-            raise ValueError(f"u_min must be below u_max = {self.u_max!r}, got {self.u_min!r}")
+            reject("u_min", self.u_min, f"below u_max = {self.u_max!r}")
         self.reset()
 
     def _check(self, check: Callable[[str, Any], Any], *names: str) -> None:
@@ -121,7 +85,7 @@ class Controller(ABC):
         # batch of loops, and None while both are allowed.
         self._loop_shape: tuple[int, ...] | None = None
 
-    def check_environment(self, parameters: Any, n: int) -> None:
+    def check_environment(self, parameters: Parameters, n: int) -> None:
         """Raise a ValueError if the controller does not fit the plants of an environment.
 
         `mptc_gym.evaluate` calls this method before an evaluation, so that a wrong limit or
@@ -130,8 +94,8 @@ class Controller(ABC):
         Parameters
         ----------
         parameters
-            Arguments of the environment, a `mptc_gym.Parameters`. An argument that is sampled
-            at each reset is a range (low, high).
+            Arguments of the environment. An argument that is sampled at each reset is a range
+            (low, high).
         n
             Number of plants.
 

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.polynomial.polynomial import polysub
 from numpy.typing import NDArray
 
-from .controller import Values, integer, not_negative, positive
+from mptc_gym.plant.checks import count_from_0, not_negative, positive
+
+from .controller import Values
 from .internal_model import InternalModelController
 
 Array = NDArray[np.float64]
@@ -68,7 +70,7 @@ class DahlinController(InternalModelController):
         super().__post_init__()
         self._check(positive, "closed_loop_time_constant")
         self._check(not_negative, "filter_time_constant")
-        self._check(integer, "setpoint_index", "error_index")
+        self._check(count_from_0, "setpoint_index", "error_index")
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
         # The shares g and f of a distance that are covered per sample; f = 1 is no filter.
         self._approach = -math.expm1(-self.sampling_interval / self.closed_loop_time_constant)

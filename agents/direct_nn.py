@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .controller import Controller, from_1, integer, not_negative, number, positive
+from mptc_gym.plant.checks import (
+    count_from_0,
+    count_from_1,
+    not_negative,
+    number,
+    positive,
+    seed,
+)
+from mptc_gym.plant.parameters import Parameters
+
+from .controller import Controller
 from .networks import read_arrays, write_arrays
 
 Array = NDArray[np.float64]
@@ -145,15 +154,16 @@ class DirectNNController(Controller):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check(from_1, "n_inputs", "n_hidden", "update_interval")
+        self._check(count_from_1, "n_inputs", "n_hidden", "update_interval")
         self._check(not_negative, "eta", "eta_1", "eta_theta", "eta_1_theta", "weight_scale")
         self._check(number, "input_scale")
         self._check(positive, "output_share")
-        self._check(integer, "error_index", "seed")
+        self._check(count_from_0, "error_index")
+        self._check(seed, "seed")
         if self.direction not in (-1, 1):
             raise ValueError(f"direction must be -1 or 1, got {self.direction!r}")
         if self.num_envs is not None:
-            self._check(from_1, "num_envs")
+            self._check(count_from_1, "num_envs")
         self.n_obs = max(self.n_inputs, self.error_index + 1)
         # Shapes of one network's weights, in the order of the fields of `Weights`.
         self._shapes = {
@@ -215,7 +225,7 @@ class DirectNNController(Controller):
         # add long rows.
         self._arrays = arrays
 
-    def check_environment(self, parameters: Any, n: int) -> None:
+    def check_environment(self, parameters: Parameters, n: int) -> None:
         """Raise a ValueError if the controller does not fit the plants of an environment.
 
         The arguments are described in `Controller.check_environment`. In addition to the checks

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .actuator import applied_flow, avoid_dead_zone
+from mptc_gym.plant.actuator import applied_flow, avoid_dead_zone
+
 from .controller import ModelBasedController, Values
 
 Array = NDArray[np.float64]

@@ -16,7 +16,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .actuator import avoid_dead_zone
+from mptc_gym.plant.actuator import avoid_dead_zone
+
 from .bank import Bank
 from .hedge import RandomSetpoint
 from .output_filter import OutputFilter

@@ -15,15 +15,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .controller import Controller, Values, not_negative, positive
+from mptc_gym.plant.actuator import command_from_action
+from mptc_gym.plant.checks import not_negative, positive
+from mptc_gym.plant.parameters import WINDOWS, Parameters
+
+from .controller import Controller, Values
 
 Array = NDArray[np.floating[Any]]
 # Layers of a network in the order of computation. Each layer is a pair of weights, shape
 # (outputs, inputs), and biases, shape (outputs,).
 Layers = Sequence[tuple[Array, Array]]
 
-# Arguments of the environment that choose the elements of an observation, in their order.
-WINDOWS: Final = ("setpoint_window", "error_window", "output_window", "action_window")
 PRETRAINED: Final = Path(__file__).parent / "pretrained"  # trained networks of this project
 FORMAT: Final = 2  # version of the format of network files
 
@@ -177,7 +179,7 @@ class PolicyNetwork(Controller):
             arrays[f"b{i}"] = b
         write_arrays(path, about=json.dumps(settings), **arrays)
 
-    def check_environment(self, parameters: Any, n: int) -> None:
+    def check_environment(self, parameters: Parameters, n: int) -> None:
         """Raise a ValueError if the network does not fit the plants of an environment.
 
         The arguments are described in `Controller.check_environment`. In addition to the checks
@@ -202,10 +204,11 @@ class PolicyNetwork(Controller):
             x = np.tanh(x @ W.T + b)
         outputs = (x @ last_W.T + last_b).astype(np.float64)
         output: NDArray[np.float64] = np.clip(outputs[:, 0], -1.0, 1.0)
-        half_range = (self.u_max - self.u_min) / 2.0
         if self.action == "change":
+            half_range = (self.u_max - self.u_min) / 2.0
             return self.max_move * half_range * output
-        return self.u_min + (output + 1.0) * half_range
+        command: NDArray[np.float64] = command_from_action(output, self.u_min, self.u_max)
+        return command
 
     def _action(self, command: Values) -> NDArray[np.float32]:
         """Return the actions that give `command`, in the shape of `command`."""

@@ -8,15 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .controller import (
-    Controller,
-    Values,
-    integer,
-    nonzero,
-    not_negative,
-    number,
-    positive,
-)
+from mptc_gym.plant.checks import count_from_0, nonzero, not_negative, number, positive
+
+from .controller import Controller, Values
 
 Array = NDArray[np.float64]
 
@@ -58,7 +52,7 @@ class PIController(Controller):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check(number, "kp", "ki")
-        self._check(integer, "error_index")
+        self._check(count_from_0, "error_index")
         self.n_obs = self.error_index + 1
 
     @classmethod

@@ -9,8 +9,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mptc_gym.plant.checks import count_from_0, not_negative, positive
+
 from .bank import Bank
-from .controller import ModelBasedController, integer, not_negative, positive
+from .controller import ModelBasedController
 from .hedge import RandomSetpoint
 from .law import Law
 
@@ -106,7 +108,7 @@ class SelfTuningController(ModelBasedController):
         super().__post_init__()
         self._check(_time_range, "delay_range", "setpoint_holds")
         self._check(positive, "setpoint_amplitude")
-        self._check(integer, "setpoint_index", "error_index")
+        self._check(count_from_0, "setpoint_index", "error_index")
         self.n_obs = max(self.setpoint_index, self.error_index) + 1
         # The settings suit time constants of up to about `LONGEST_TIME_CONSTANT` samples. So
         # the controller changes the command of a slower plant only at every `_samples_held`-th

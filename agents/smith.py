@@ -8,7 +8,9 @@ import numpy as np
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
-from .controller import Values, integer, positive
+from mptc_gym.plant.checks import count_from_0, positive
+
+from .controller import Values
 from .internal_model import InternalModelController
 from .pi import PIController
 
@@ -59,7 +61,7 @@ class SmithPredictor(InternalModelController):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check(positive, "closed_loop_time_constant")
-        self._check(integer, "error_index")
+        self._check(count_from_0, "error_index")
         rule = PIController.simc(
             gain=self.gain,
             time_constant=self.time_constant,

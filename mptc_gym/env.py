@@ -15,8 +15,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
+from mptc_gym.plant.actuator import WantedFlow, action_from_command
 from mptc_gym.plant.checks import NOT_A_NUMBER, one_action, one_of, to_python
-from mptc_gym.plant.dynamics import Plant, WantedFlow, action_from_command
+from mptc_gym.plant.dynamics import Plant
 from mptc_gym.plant.parameters import Parameters, full_signature, insert_table
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import ONLY_PLANT, Signals

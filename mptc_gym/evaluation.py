@@ -12,8 +12,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mptc_gym.plant.actuator import action_from_command
 from mptc_gym.plant.checks import count
-from mptc_gym.plant.dynamics import action_from_command
 from mptc_gym.plant.parameters import ARGUMENTS, INTERFACE, Parameters
 from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.rollout import (

@@ -14,8 +14,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
+from mptc_gym.plant.actuator import action_from_command
 from mptc_gym.plant.checks import reject, shorten
-from mptc_gym.plant.dynamics import action_from_command
 from mptc_gym.plant.parameters import INTERFACE, Parameters
 from mptc_gym.vector_env import MiddlePointVectorEnv, parameters_of
 

@@ -36,15 +36,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.plant.checks import NOT_A_NUMBER, count, one_of, reject
-from mptc_gym.plant.dynamics import (
-    DRIFT_INTERVAL,
-    FACTORS,
-    Dynamics,
+from mptc_gym.plant import checks
+from mptc_gym.plant.actuator import (
     WantedFlows,
     action_from_command,
     least_effective_command,
 )
+from mptc_gym.plant.checks import NOT_A_NUMBER, one_of, reject
+from mptc_gym.plant.dynamics import DRIFT_INTERVAL, FACTORS, Dynamics
 from mptc_gym.plant.parameters import ARGUMENTS, Parameters, PlantNumbers, full_signature
 from mptc_gym.plant.signals import LOAD_INTERVAL, SetPointLevels, noise_polynomials
 
@@ -211,11 +210,6 @@ class _Load(_Signal):
 class _WantedFlows(WantedFlows):
     """The wanted flows of n plants in PyTorch, for the action form "change"."""
 
-    def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
-        super().__init__(parameters, len(zeros))
-        self._flows = zeros
-        self._dead_zone = zeros + self._dead_zone  # in the type of the environment
-
     def reset(self, plants: Any) -> None:
         """Set the wanted flows of the plants in the mask `plants` to 0 t/h."""
         self._flows = self._flows.masked_fill(plants, 0.0)
@@ -224,15 +218,10 @@ class _WantedFlows(WantedFlows):
         """Cut the gradient graph of earlier actions."""
         self._flows = self._flows.detach()
 
-    def _rounded_actions(self, commands: Any) -> Any:
-        """Return actions for commands, as `float32_action` does in NumPy, with gradients."""
-        actions = action_from_command(commands, self._u_min, self._u_max).to(torch.float32)
-        rounded_commands = (actions.to(commands.dtype) + 1.0) * self._half_range + self._u_min
-        had_effect = commands.abs() >= self._dead_zone
-        magnitude = actions.detach().abs().clamp(min=1.0)
-        spacing = torch.nextafter(magnitude, 2.0 * magnitude) - magnitude  # of float32 numbers
-        is_lost = had_effect & (rounded_commands.abs() < self._dead_zone)
-        return (actions + is_lost * spacing.copysign(commands.detach())).to(commands.dtype)
+    @staticmethod
+    def _to_float32(values: Any) -> Any:
+        """Round a tensor to float32, and return it in its own type."""
+        return values.to(torch.float32).to(values.dtype)
 
 
 class _Plants:
@@ -718,7 +707,7 @@ class MiddlePointTorchEnv(BatchEnv):
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Restart the random number generator of all plants with the seed, if there is one."""
         if seed is not None:
-            self._generator.manual_seed(count("seed", seed, 0, maximum=(1 << 63) - 1))
+            self._generator.manual_seed(checks.seed("seed", seed))
         self._np_random_seed = self._generator.initial_seed()
 
     def _checked_actions(self, actions: Any) -> Tensor:

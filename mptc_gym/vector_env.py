@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from mptc_gym.batch import BatchEnv, Infos, Mask
 from mptc_gym.env import EPISODE_STEPS, INFO, NO_RENDER_MODE, Frame, MiddlePointEnv
+from mptc_gym.plant.actuator import WantedFlows, action_from_command
 from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_python
-from mptc_gym.plant.dynamics import PlantBatch, WantedFlows, action_from_command
+from mptc_gym.plant.dynamics import PlantBatch
 from mptc_gym.plant.parameters import Parameters, full_signature
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
@@ -114,7 +115,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._plants = PlantBatch(parameters, num_envs)
         self._wanted_flows: WantedFlows | None = None
         if parameters.action == "change":
-            self._wanted_flows = WantedFlows(parameters, num_envs)
+            self._wanted_flows = WantedFlows(parameters, np.zeros(num_envs))
         self._window = _Window(parameters.windows, num_envs)
         self._last_actions = np.zeros(num_envs)
         # In comparisons, an array of shape (num_envs,) is faster than a Python number. In other

@@ -37,8 +37,8 @@ setpoints = st.floats(-100, 100)
 # The strategy of an argument, by the check of the argument.
 BY_CHECK = {
     checks.number: small_numbers,
-    checks.samples: st.integers(0, 30),
-    checks.duration: st.integers(1, 100),
+    checks.count_from_0: st.integers(0, 30),
+    checks.count_from_1: st.integers(1, 100),
     checks.not_negative: st.floats(0, 4),
     checks.at_least_1: st.floats(1, 100),
     checks.positive: st.floats(0.5, 4),

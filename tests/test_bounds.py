@@ -21,7 +21,7 @@ from benchmarks.loop.measures import mean_error
 from benchmarks.loop.runs import make_plants, simulate
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import Parameters
-from mptc_gym.plant.dynamics import action_from_command
+from mptc_gym.plant.actuator import action_from_command
 from tests.verify_bounds import CONTROLLERS, beats, errors
 
 CALM = Parameters()

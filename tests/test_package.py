@@ -11,20 +11,25 @@ from tests.conftest import ROOT, python
 
 ALLOWED = {
     "mptc_gym": {"mptc_gym", "gymnasium", "numpy", "pygame"},  # pygame within functions
-    "agents": {"agents", "numpy"},
+    "agents": {"agents", "mptc_gym", "numpy"},
 }
 FOLDERS = "mptc_gym", "agents", "benchmarks"
 
 
-def packages(code):
-    """Return the packages that some code imports, also within functions."""
+def modules_of(code):
+    """Return the modules that some code imports, also within functions."""
     modules = set()
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and not node.level:  # not of the same package
             modules.add(node.module or "")
-    return {module.partition(".")[0] for module in modules}
+    return modules
+
+
+def packages(code):
+    """Return the packages that some code imports, also within functions."""
+    return {module.partition(".")[0] for module in modules_of(code)}
 
 
 @pytest.mark.parametrize("package", ALLOWED)
@@ -35,6 +40,21 @@ def test_layers_import_downwards_only(package):
         if path.name in ("sb3.py", "sb3_vec_env.py"):
             allowed |= {"stable_baselines3", "torch"}
         assert packages(path.read_text("utf-8")) <= allowed, path
+
+
+def test_controllers_import_the_plant_and_no_environment():
+    for path in (ROOT / "agents").rglob("*.py"):
+        for module in modules_of(path.read_text("utf-8")):
+            assert not f"{module}.".startswith("mptc_gym.") or module.startswith(
+                "mptc_gym.plant."
+            ), path
+
+
+def test_importing_controllers_loads_no_extra():
+    process = python("-c", "import agents, sys; print(*sys.modules)")
+    extras = {"matplotlib", "pandas", "pygame", "scipy", "torch"}
+    assert not extras & {*process.stdout.split()}
+    assert "agents.pi" in process.stdout.split()
 
 
 PAGES = [ROOT / "README.md"]

@@ -7,8 +7,14 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 import mptc_gym
-from agents import actuator
-from mptc_gym.plant.dynamics import Plant, action_from_command, float32_action
+from mptc_gym.plant.actuator import (
+    action_from_command,
+    applied_flow,
+    command_from_action,
+    float32_action,
+    least_effective_command,
+)
+from mptc_gym.plant.dynamics import Plant, PlantBatch
 from mptc_gym.plant.parameters import PlantNumbers
 from mptc_gym.plant.sampling import EpisodeStream
 from tests.conftest import run
@@ -43,7 +49,7 @@ def float64_action(command, u_min, u_max, dead_zone):
     return action_from_command(command, u_min, u_max)
 
 
-@pytest.mark.parametrize("to_action", [float64_action, float32_action, actuator.float32_action])
+@pytest.mark.parametrize("to_action", [float64_action, float32_action])
 @settings(max_examples=50, deadline=None)
 @given(
     u_min=st.floats(-20, 5),
@@ -76,18 +82,52 @@ def test_a_command_on_the_edge_of_the_dead_zone_passes_as_an_action(
         assert received == pytest.approx(command, abs=1.3e-7 * (reach + abs(u_min) + edge))
 
 
-@pytest.mark.parametrize("to_action", [float32_action, actuator.float32_action])
-def test_only_commands_on_the_edge_are_moved_each_by_its_own_limits(to_action, rng):
+@pytest.mark.parametrize(
+    "limits", [(-10.0, 10.0, 7.0), (-1.0, 12.0, 7.1), (3.0, 5.0, 4.1), (0.0, 4.0, 0.0)]
+)
+def test_plants_apply_what_the_actuator_defines(limits, rng):
+    u_min, u_max, dead_zone = limits
+    edge = least_effective_command(dead_zone, u_min, u_max)
+    just_inside = np.nextafter(edge, 0.0)
+    commands = np.array([edge, -edge, just_inside, -just_inside, dead_zone, u_min, u_max, 0.0])
+    actions = action_from_command(np.r_[commands, rng.uniform(-15, 15, 100)], u_min, u_max)
+    expected_commands = command_from_action(actions, u_min, u_max)
+    expected_flows = applied_flow(expected_commands, edge, u_min, u_max)
+    parameters = mptc_gym.Parameters(u_min=u_min, u_max=u_max, dead_zone=dead_zone)
+    n = len(actions)
+    commands, flows, _ = PlantBatch(parameters, n).step(actions, np.zeros(n))
+    np.testing.assert_array_equal(commands, expected_commands)
+    np.testing.assert_array_equal(flows, expected_flows)
+    plant = Plant(parameters, parameters.lowest)
+    for action, command, flow in zip(actions, expected_commands, expected_flows, strict=True):
+        assert plant.step(action.item(), 0.0, 0.0)[:2] == (command, flow)
+
+
+def test_rounding_moves_an_action_by_one_spacing_of_float32(rng):
+    # Limits inside the dead zone, so that actions on its edge are beyond 1.
+    limits = rng.uniform(0.5, 4.0, 2000)
+    edges = limits * rng.uniform(1.0, 8.0, 2000) * rng.choice([-1.0, 1.0], 2000)
+    rounded = action_from_command(edges, -limits, limits).astype(np.float32)
+    moved = float32_action(edges, -limits, limits, np.abs(edges))
+    is_moved = moved != rounded
+    assert 500 < is_moved.sum() < 1500
+    outwards = np.copysign(np.inf, edges).astype(np.float32)
+    np.testing.assert_array_equal(
+        moved[is_moved], np.nextafter(rounded[is_moved], outwards[is_moved])
+    )
+
+
+def test_only_commands_on_the_edge_are_moved_each_by_its_own_limits(rng):
     commands = rng.uniform(-12, 12, 1000)
     rounded = action_from_command(commands, -10.0, 10.0).astype(np.float32)
-    np.testing.assert_array_equal(to_action(commands, -10.0, 10.0, 7.0), rounded)
-    inside = to_action(np.nextafter(7.0, 0.0), -10, 10, 7.0)
+    np.testing.assert_array_equal(float32_action(commands, -10.0, 10.0, 7.0), rounded)
+    inside = float32_action(np.nextafter(7.0, 0.0), -10, 10, 7.0)
     numbers = PlantNumbers(delay=0.0, dead_zone=7.0, u_min=-10.0, u_max=10.0)
     assert Plant(mptc_gym.Parameters(), numbers).step(inside.item(), 0.0, 0.0)[1] == 0.0
     zones = np.array([4.1, 6.3, 7.0])
     limits = np.array([10.0, 11.0, 12.0])
-    one_by_one = [to_action(zones[i], -10.0, limits[i], zones[i]) for i in range(3)]
-    np.testing.assert_array_equal(to_action(zones, -10.0, limits, zones), one_by_one)
+    one_by_one = [float32_action(zones[i], -10.0, limits[i], zones[i]) for i in range(3)]
+    np.testing.assert_array_equal(float32_action(zones, -10.0, limits, zones), one_by_one)
 
 
 def test_an_episode_begins_2_to_the_64_random_numbers_after_the_previous_episode():

@@ -18,7 +18,7 @@ from hypothesis import strategies as st  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
 from mptc_gym import PRESETS, MiddlePointVectorEnv, torch_env  # noqa: E402
-from mptc_gym.plant.dynamics import action_from_command, float32_action  # noqa: E402
+from mptc_gym.plant.actuator import action_from_command, float32_action  # noqa: E402
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams  # noqa: E402
 from mptc_gym.plant.signals import Signals  # noqa: E402
 from mptc_gym.torch_env import MiddlePointTorchEnv, make_vec  # noqa: E402
@@ -221,8 +221,8 @@ class TestGradients:
         actions = size * torch.tensor([1.0, -1.0]).repeat(6)[:, None, None]
         if env.parameters.action == "change":
             actions = actions.abs()  # the flow stays far from 0
-            # Differences cannot be taken of commands that are rounded to float32.
-            env._wanted_flows._rounded_actions = lambda command: command / 10.0
+            # Differences cannot be taken of actions that are rounded to float32.
+            env._wanted_flows._to_float32 = lambda values: values
         assert torch.autograd.gradcheck(returned, actions.requires_grad_(), fast_mode=True)
 
     def test_it_goes_straight_through_the_dead_zone_and_ends_at_the_limits(self):

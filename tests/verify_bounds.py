@@ -15,7 +15,7 @@ from benchmarks.loop.measures import mean_error
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import SEED
-from mptc_gym.plant.dynamics import action_from_command
+from mptc_gym.plant.actuator import action_from_command
 
 RUNS = 300
 SAMPLES = 1200  # of a run

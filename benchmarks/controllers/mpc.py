@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.actuator import applied_flow, float32_action
 from agents.hedge import RandomSetpoint
 from benchmarks.loop.linear import LOAD_STEPS, LOAD_WALK, LinearModel
 from benchmarks.loop.runs import drawn_numbers
 from mptc_gym import Parameters
+from mptc_gym.plant.actuator import applied_flow, float32_action
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL
 from mptc_gym.plant.signals import LOAD_INTERVAL, SetPointLevels
 

@@ -31,6 +31,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from mptc_gym import Parameters
+from mptc_gym.plant.actuator import applied_flow
 
 Array = NDArray[np.float64]
 # The longest delay that a fit tries, samples. If the delay of a plant has more samples, the log
@@ -123,7 +124,7 @@ def main(
         Parameters(dead_zone=dead_zone, u_min=u_min, u_max=u_max, sampling_interval=interval)
     except ValueError as error:
         raise SystemExit(str(error)) from error
-    applied = np.where(np.abs(log.flow) < dead_zone, 0.0, np.clip(log.flow, u_min, u_max))
+    applied = applied_flow(log.flow, dead_zone, u_min, u_max)
     if np.count_nonzero(np.diff(applied)) < 2:  # The fit could take one move for the start.
         raise SystemExit(
             f"{log_file}: the flow must move twice or more, outside the dead zone and within "

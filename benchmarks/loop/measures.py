@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks.loop.runs import Trajectory
 from mptc_gym import Parameters
-from mptc_gym.plant.dynamics import least_effective_command
+from mptc_gym.plant.actuator import least_effective_command
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters  # which registers the environment
-from mptc_gym.plant.dynamics import action_from_command
+from mptc_gym.plant.actuator import action_from_command
 from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers
 from mptc_gym.rollout import Act, rollout, start
 

@@ -137,6 +137,15 @@ def number(
 
 not_negative = partial(number, low=0.0)
 positive = partial(number, low=1e-9)  # not 0.0, as `number` allows the value `low` itself
+
+
+def nonzero(name: str, value: Any) -> float:
+    """Return a number other than 0 as a float; ValueError for 0 and for what is no number."""
+    if value == 0.0:
+        reject(name, value, "a number other than 0")
+    return number(name, value)
+
+
 at_least_1 = partial(number, low=1.0)
 share_of_range = partial(number, low=1e-9, high=2.0)  # in halves of the range
 
@@ -148,8 +157,9 @@ def count(name: str, value: Any, minimum: int, maximum: int = LARGEST_NUMBER) ->
     return int(value)
 
 
-samples = partial(count, minimum=0)
-duration = partial(count, minimum=1)  # in samples
+count_from_0 = partial(count, minimum=0)
+count_from_1 = partial(count, minimum=1)
+seed = partial(count, minimum=0, maximum=(1 << 63) - 1)  # as large as PyTorch takes
 
 
 def number_list(name: str, value: Any) -> tuple[float, ...]:

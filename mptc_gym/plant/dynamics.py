@@ -1,17 +1,17 @@
-"""Simulate the plant and the actuator, without set point, reward and Gymnasium.
+"""Simulate the plant with its actuator, without set point, reward and Gymnasium.
 
 `Plant` simulates one plant in Python floats, which is the fastest way for one plant.
 `PlantBatch` simulates many plants in NumPy arrays. `Plant` and `PlantBatch` do the same
 operations in the same order, so that the results are equal bit for bit.
 
-The paper that the docstring of `MiddlePointEnv` cites describes the plant by equation (28) and
-the actuator by equation (29)::
+The paper that the docstring of `MiddlePointEnv` cites describes the plant by equation (28)::
 
     (28)  A(z^-1) y(k) = B(z^-1) u_a(k - d) + C(z^-1) xi(k)
-    (29)  u_a = 0 where |u| < dead_zone, otherwise u limited to [u_min, u_max]
 
-In equations (28) and (29), y is the temperature, u the commanded flow, u_a the applied flow, d
-the delay in samples and xi white noise.
+In equation (28), y is the temperature, u_a the applied flow, d the delay in samples and xi
+white noise. The actuator, equation (29), is defined in `mptc_gym.plant.actuator`. For speed,
+`Plant.step` and `PlantBatch.step` have the lines of `command_from_action` and `applied_flow`
+written out, with equal results.
 """
 
 from collections import deque
@@ -21,6 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mptc_gym.plant.actuator import least_effective_command
 from mptc_gym.plant.parameters import Parameters, PlantNumbers, slowest_pole
 
 Values = NDArray[np.float64]  # one element per plant, shape (n,)
@@ -31,170 +32,6 @@ _ARRAY_OF_1 = np.array(1.0)
 # and computing a change takes time.
 DRIFT_INTERVAL: Final = 10
 FACTORS: Final = "gain_factor", "time_constant_factor"  # keys of the drift factors in infos
-
-
-def action_from_command(command: Any, u_min: Any, u_max: Any) -> Any:
-    """Return the normalised action for a flow command: -1 for `u_min`, and 1 for `u_max`.
-
-    Flow command and limits are in t/h, as floats, arrays or tensors that can be broadcast. A
-    command below `u_min` gives an action below -1, and a command above `u_max` an action above
-    1.
-    """
-    return 2.0 * (command - u_min) / (u_max - u_min) - 1.0
-
-
-def least_effective_command(
-    dead_zone: Any, u_min: Any, u_max: Any, rounding: float = 2.0**-50
-) -> Any:
-    """Return the smallest magnitude of a flow command, t/h, that the dead zone lets pass.
-
-    The result is a few rounding errors smaller than `dead_zone`, so that a command on the edge
-    of the dead zone still has an effect after scaling to an action and back.
-
-    Parameters
-    ----------
-    dead_zone
-        Half width of the dead zone, t/h: a float, an array or a tensor.
-    u_min, u_max
-        Limits of the actuator, t/h.
-    rounding
-        Upper bound of the accumulated rounding error, divided by u_max - u_min + |u_max| +
-        |u_min|. The default bound, 2^-50, is enough for 8 float64 operations with a relative
-        rounding error of 2^-53 each.
-    """
-    return dead_zone - rounding * (u_max - u_min + abs(u_max) + abs(u_min))
-
-
-def float32_action(command: Any, u_min: Any, u_max: Any, dead_zone: Any) -> NDArray[np.float32]:
-    """Return the float32 actions with which the environment commands given flows in t/h.
-
-    Rounding to float32 can move a command from the edge of the dead zone into the dead zone:
-    with the default limits, the action float32(0.7) commands 6.99999988 t/h, which is inside a
-    dead zone of 7 t/h. If rounding moves a command into the dead zone, the action is moved out
-    of the dead zone by the spacing of float32 numbers near 1, or near the action if its
-    magnitude is above 1.
-
-    Parameters
-    ----------
-    command
-        Commanded flows, t/h, of any shape.
-    u_min, u_max
-        Limits of the actuator, t/h.
-    dead_zone
-        Half width of the dead zone, t/h.
-
-    Returns
-    -------
-    ndarray of float32
-        Normalised actions, of the shape to which the four arguments broadcast.
-    """
-    commands = np.asarray(command, float)
-    actions = np.asarray(action_from_command(commands, u_min, u_max)).astype(np.float32)
-    half_range = (u_max - u_min) / 2.0
-    # The commands that the plant computes from the rounded actions, t/h.
-    rounded_commands = (actions.astype(float) + 1.0) * half_range + u_min
-    had_effect = np.abs(commands) >= dead_zone
-    has_effect = np.abs(rounded_commands) >= dead_zone
-    # The plant adds 1 to the action, so the rounding of the sum could remove a smaller step.
-    spacing = np.spacing(np.maximum(np.abs(actions), np.float32(1.0)))
-    moved_actions = actions + np.copysign(spacing, commands).astype(np.float32)
-    return np.where(had_effect & ~has_effect, moved_actions, actions)
-
-
-class WantedFlows:
-    """The wanted flows of n plants, which actions change: the action form "change".
-
-    In process control, a change of the flow at each sample is called the velocity form. An
-    action w(k) changes the wanted flow v, t/h, which is 0 before k = 0::
-
-        v(k) = v(k-1) + w(k) max_move (u_max - u_min) / 2,   limited to [u_min, u_max]
-
-    The commanded flow u skips the dead zone with the half width z = `compensated_dead_zone`::
-
-        v > 0:   u =  z + (u_max - z) v / u_max
-        v = 0:   u =  0
-        v < 0:   u = -z + (u_min + z) v / u_min
-
-    If a limit lies inside the dead zone, all commands towards this limit are on the edge of the
-    dead zone, and the actuator applies the limit.
-
-    Parameters
-    ----------
-    parameters
-        Arguments of the environment.
-    n
-        Number of plants.
-    """
-
-    def __init__(self, parameters: Parameters, n: int) -> None:
-        self._u_min = parameters.lowest.u_min
-        self._u_max = parameters.lowest.u_max
-        self._half_range = (self._u_max - self._u_min) / 2.0
-        self._flow_per_action = parameters.max_move * self._half_range
-        self._dead_zone: Any = parameters.compensated_dead_zone
-        self._slope_above = self._slope(self._u_max)
-        self._slope_below = self._slope(-self._u_min)
-        self._flows: Any = np.zeros(n)  # v, t/h
-
-    def _slope(self, limit: float) -> float:
-        """Return du/dv for flows towards a limit whose magnitude is `limit`, t/h."""
-        if limit <= 0.0:  # no wanted flow has this direction
-            return 0.0
-        return float(max(limit - self._dead_zone, 0.0) / limit)
-
-    def reset(self, plants: NDArray[np.intp]) -> None:
-        """Set the wanted flows of the plants with the indices `plants` to 0 t/h."""
-        self._flows[plants] = 0.0
-
-    def change(self, actions: Any) -> Any:
-        """Change the wanted flows, and return the actions that set them, shape (n,).
-
-        `actions` are finite and are clipped to +-1: an array, or a tensor in a subclass. The
-        returned actions are rounded to float32, as the actions of a policy are.
-        """
-        flows = self._flows + self._flow_per_action * actions.clip(-1.0, 1.0)
-        self._flows = flows.clip(self._u_min, self._u_max)
-        is_above = self._flows > 0.0
-        is_below = self._flows < 0.0
-        edges = is_above * self._dead_zone - is_below * self._dead_zone
-        above = is_above * (self._slope_above * self._flows)
-        below = ~is_above * (self._slope_below * self._flows)
-        return self._rounded_actions(edges + above + below)
-
-    def _rounded_actions(self, commands: Any) -> Any:
-        """Return the actions that command flows, t/h, rounded to float32."""
-        rounded = float32_action(commands, self._u_min, self._u_max, self._dead_zone)
-        return rounded.astype(np.float64)
-
-
-class WantedFlow(WantedFlows):
-    """The wanted flow of one plant in Python floats, equal bit for bit to `WantedFlows`.
-
-    Parameters
-    ----------
-    parameters
-        Arguments of the environment.
-    """
-
-    def __init__(self, parameters: Parameters) -> None:
-        super().__init__(parameters, 1)
-        self._flow = 0.0  # v, t/h
-
-    def change(self, actions: float) -> float:
-        """Change the wanted flow by one finite action, and return the action that sets it."""
-        flow = self._flow + self._flow_per_action * max(-1.0, min(1.0, actions))
-        self._flow = flow = max(self._u_min, min(self._u_max, flow))
-        command = 0.0
-        if flow > 0.0:
-            command = self._dead_zone + self._slope_above * flow
-        elif flow < 0.0:
-            command = -self._dead_zone + self._slope_below * flow
-        action = float(np.float32(action_from_command(command, self._u_min, self._u_max)))
-        rounded_command = (action + 1.0) * self._half_range + self._u_min
-        # Rarely, rounding moves a command from the edge of the dead zone into the dead zone.
-        if abs(command) >= self._dead_zone > abs(rounded_command):
-            return float(self._rounded_actions(command))
-        return action
 
 
 class Dynamics:
@@ -297,11 +134,6 @@ class Dynamics:
 class Plant:
     """One plant with its actuator, initially at rest: equations (28) and (29) of the paper.
 
-    One case of equation (29), as printed in the paper, compares the magnitude of the command u
-    with the lower limit U_min. `Plant` implements the intended meaning of equation (29): a
-    command inside the dead zone has no effect, and a command on the edge of the dead zone or
-    outside the dead zone is limited to [U_min, U_max].
-
     Parameters
     ----------
     parameters
@@ -361,11 +193,10 @@ class Plant:
             self._k += 1
             if self._k % DRIFT_INTERVAL == 0:
                 self._update_dynamics()
-        # The last formula of the paper's Section 4 scales the outputs of a neural network, from
-        # 0 to 1, to flows. Here, the formula is rewritten for actions from -1 to 1.
+        # `command_from_action` of `mptc_gym.plant.actuator`, written out for speed.
         u_min = self._u_min
         command = u_min + (action + 1.0) * self._half_range
-        # Equation (29): dead zone and limits.
+        # Equation (29): `applied_flow` of `mptc_gym.plant.actuator`, written out for speed.
         applied = command
         if -self._least_effective_command < command < self._least_effective_command:
             applied = 0.0
@@ -486,11 +317,12 @@ class PlantBatch:
             self._clock += 1
             if self._clock >= self._next_update:
                 self._update_dynamics()
+        # `command_from_action` of `mptc_gym.plant.actuator`, written out for speed:
         # `_ARRAY_OF_0` and `_ARRAY_OF_1` stand for 0 and 1, as NumPy adds arrays faster.
         command = action + _ARRAY_OF_1
         command *= self._half_range
         command += self.numbers.u_min
-        # Equation (29): limits and dead zone.
+        # Equation (29): `applied_flow` of `mptc_gym.plant.actuator`, written out for speed.
         applied = np.minimum(command, self._u_max)
         np.maximum(applied, self._u_min, out=applied)
         # A product is faster than a mask, whose branches are unpredictable. The product can be

@@ -42,7 +42,7 @@ class PlantNumbers(Generic[Value]):
     """
 
     delay: Value = _argument(
-        18, checks.samples, "samples", "transport delay d in equation (28)"
+        18, checks.count_from_0, "samples", "transport delay d in equation (28)"
     )
     dead_zone: Value = _argument(
         5.0, checks.not_negative, "t/h", "half width of the dead zone in equation (29)"
@@ -152,7 +152,7 @@ class Parameters(PlantNumbers[Number]):
         "coefficients of C in equation (28), from z^0 on; the first is 1",
     )
     drift_samples: int = _argument(
-        1200, checks.duration, "samples", "time in which gain and time constant drift"
+        1200, checks.count_from_1, "samples", "time in which gain and time constant drift"
     )
     sampling_interval: float = _argument(
         8.0,
@@ -177,7 +177,7 @@ class Parameters(PlantNumbers[Number]):
     )
     setpoint_period: int = _argument(
         600,
-        checks.duration,
+        checks.count_from_1,
         "samples",
         'P: "square" repeats every P samples; "random" holds each level for a uniform random '
         "number of samples from P/6 to P/2",
@@ -185,16 +185,19 @@ class Parameters(PlantNumbers[Number]):
     # The default observation is the six inputs of the paper's network: the set points y_d(k),
     # y_d(k-1), y_d(k-2) and the errors e(k), e(k-1), e(k-2).
     setpoint_window: int = _argument(
-        3, checks.samples, "samples", "number of latest set points in the observation"
+        3, checks.count_from_0, "samples", "number of latest set points in the observation"
     )
     error_window: int = _argument(
-        3, checks.samples, "samples", "number of latest errors in the observation"
+        3, checks.count_from_0, "samples", "number of latest errors in the observation"
     )
     output_window: int = _argument(
-        0, checks.samples, "samples", "number of latest measured outputs in the observation"
+        0,
+        checks.count_from_0,
+        "samples",
+        "number of latest measured outputs in the observation",
     )
     action_window: int = _argument(
-        0, checks.samples, "samples", "number of latest past actions in the observation"
+        0, checks.count_from_0, "samples", "number of latest past actions in the observation"
     )
     temperature_span: float = _argument(
         50.0,
