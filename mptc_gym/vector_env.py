@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -20,12 +19,11 @@ from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_pyt
 from mptc_gym.plant.dynamics import PlantBatch
 from mptc_gym.plant.parameters import Parameters, full_signature
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
-from mptc_gym.plant.signals import SAMPLES_AT_A_TIME, Indices, Signals, Values
+from mptc_gym.plant.signals import Indices, Signals, Values
 from mptc_gym.record import Record
 
 Observations = NDArray[np.float32]  # shape (num_envs, size)
 
-NOISE_BYTES = 1 << 27  # most bytes for a block of noise: 128 MiB
 # Number of steps after which all observations are moved in memory, so rarely that the moves
 # take little time. The moves need memory for one more element per step.
 STEPS_PER_SHIFT = 64
@@ -73,9 +71,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     float32.
 
     A step uses array arithmetic only, except when each plant draws random numbers from a
-    separate generator: at the start of an episode, about every 600 samples of noise or load
-    (more often for the noise of more than 28,000 plants), and when a random set point changes.
-    The memory for one plant is a few KiB, and does not grow with the length of an episode.
+    separate generator: at the start of an episode, and about every 600 samples. Noise, load,
+    measurement noise and random set points of these samples take 5 KiB each for a plant, but at
+    most 256 MiB for all plants: with all four, more than 14,000 plants draw more often. The
+    memory does not grow with the length of an episode.
 
     With an unstable polynomial `a`, the temperature may overflow. With actions beyond +-1e154,
     squared actions and commanded flows may overflow, but the actuator limits the applied flow.
@@ -105,13 +104,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._records: dict[int, Record] = {}
         self._seeds: list[int | None] = [None] * num_envs
         self._plant_sampler = PlantSampler(parameters)
-        # The blocks of noise of an episode end at or shortly after the end of the episode, so
-        # that little noise is generated in vain. Where many plants would need much memory, the
-        # blocks are shorter, which is slower.
-        most_samples = max(1, min(SAMPLES_AT_A_TIME, NOISE_BYTES // (8 * num_envs)))
-        blocks_per_episode = math.ceil(self._episode_length / most_samples)
-        block = math.ceil(self._episode_length / blocks_per_episode)
-        self._signals = Signals.of(parameters, num_envs, block)
+        self._signals = Signals.of(parameters, num_envs, self._episode_length)
         self._plants = PlantBatch(parameters, num_envs)
         self._wanted_flows: WantedFlows | None = None
         if parameters.action == "change":
@@ -239,11 +232,12 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
         """Begin an episode of the plants in `mask`, and return the infos that are not 0."""
         which = np.flatnonzero(mask)  # the indices of the plants
-        numbers = self._plant_sampler.sample([self._streams[i] for i in which.tolist()])
+        streams = [self._streams[i] for i in which.tolist()]
+        numbers = self._plant_sampler.sample(streams)
         self._plants.reset(which, numbers)
         if self._wanted_flows is not None:
             self._wanted_flows.reset(which)
-        setpoint = self._signals.reset(which, self._streams, numbers)
+        setpoint = self._signals.reset(which, streams, numbers)
         rest_action = action_from_command(0.0, numbers.u_min, numbers.u_max)
         self._last_actions[which] = rest_action
         self._window.reset(which, setpoint, rest_action)

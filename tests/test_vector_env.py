@@ -66,15 +66,38 @@ def test_it_equals_one_environment_after_the_other(
     rng = np.random.default_rng(randomness)
     if seed is None:
         seed = rng.integers(0, 2**40, num_envs).tolist()
-    with (  # so small that many blocks are made and the window is moved back often
-        patch.multiple("mptc_gym.vector_env", SAMPLES_AT_A_TIME=7, STEPS_PER_SHIFT=3),
-        patch.multiple("mptc_gym.plant.signals", PLANTS_AT_A_TIME=2),
+    # So small that many blocks are made and the window is moved back often. The blocks of the
+    # single environments are not shortened.
+    _, sync = native_and_sync(num_envs, mode, limit, **arguments)
+    with (
+        patch("mptc_gym.vector_env.STEPS_PER_SHIFT", 3),
+        patch("mptc_gym.plant.signals.PLANTS_AT_A_TIME", 2),
     ):
-        native, sync = native_and_sync(num_envs, mode, limit, **arguments)
+        with patch("mptc_gym.plant.signals.BLOCK_BYTES", 7 * 4 * 8 * num_envs):
+            native, _ = native_and_sync(num_envs, mode, limit, **arguments)
         assert_equal(native.reset(seed=seed), sync.reset(seed=seed))
         compare(native, sync, steps=40, rng=rng, partial_resets=partial_resets)
         assert_equal(native.reset(), sync.reset())
         compare(native, sync, steps=10, rng=rng, partial_resets=partial_resets)
+
+
+@pytest.mark.parametrize("samples", [1, 7, 10, 64])
+@pytest.mark.parametrize("mode", MODES)
+def test_shortened_blocks_change_nothing(mode, samples, rng):
+    arguments = {**PRESETS["hard"], "setpoint_period": 30, "measurement_noise_variance": 0.1}
+    _, sync = native_and_sync(3, mode, 45, **arguments)
+    values_per_sample = 3 * 4  # of 3 plants with 4 random signals
+    with patch("mptc_gym.plant.signals.BLOCK_BYTES", 8 * values_per_sample * samples):
+        native, _ = native_and_sync(3, mode, 45, **arguments)
+    assert len(native._signals.noise._block) <= samples
+    assert_equal(native.reset(seed=5), sync.reset(seed=5))
+    compare(native, sync, steps=150, rng=rng, partial_resets=0.02)
+
+
+def test_the_blocks_of_many_plants_take_at_most_256_mib():
+    envs = MiddlePointVectorEnv(50_000, **PRESETS["hard"])
+    blocks = [signal._block for signal in envs._signals]
+    assert 200 * 2**20 < sum(block.nbytes for block in blocks) <= 256 * 2**20
 
 
 @pytest.mark.parametrize(
@@ -106,7 +129,7 @@ def test_a_plant_costs_a_few_kib_and_nothing_grows_in_the_long_run():
     envs.step(np.zeros((500, 1)))
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert size / 500 < 12 * 1024
+    assert size / 500 < 16 * 1024  # of which two blocks of 600 samples take 9.4 KiB
     envs, sizes = MiddlePointVectorEnv(2, **arguments), []
     envs.reset(seed=0)
     for _ in range(2):

@@ -5,9 +5,11 @@ some plants at sample k = 0. `next` returns the values of a signal at the next s
 per plant. In an environment with one plant, `ahead` returns the values of a signal at the next
 600 samples (`SAMPLES_AT_A_TIME`), which is faster than 600 calls of `next`.
 
-Noise and load disturbance draw many random numbers at a time, because one call of a random
-number generator is much faster than many calls and returns the same random numbers. A random
-set point, which changes rarely, draws random numbers for one level at a time.
+Every random signal is generated for a block of successive samples at a time, in the same way
+for one plant and for many: one call of a random number generator is much faster than many calls
+and returns the same random numbers. A block that goes on after the end of an episode does no
+harm, as every episode has random numbers of its own (`EpisodeStream`). A set point that repeats
+needs no block.
 
 Formulas use the symbols of the paper: set point y_d(k), temperature y(k), and coloured noise
 n(k) = C(z^-1) xi(k) with white noise xi. The load disturbance w(k) is not in the paper.
@@ -17,7 +19,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,14 +31,13 @@ from mptc_gym.plant.sampling import EpisodeStream, RandomStreams
 # One element per plant, shape (n,); a value that all plants share has the shape ().
 Values = NDArray[np.float64]
 Indices = NDArray[np.intp]  # the indices of some plants, in ascending order
-StreamsOfPlants = Mapping[int, RandomStreams] | Sequence[RandomStreams]  # by index of the plant
 
-SAMPLES_AT_A_TIME = 600  # samples of a signal that are generated together
+SAMPLES_AT_A_TIME = 600  # most samples of a signal that are generated together
+BLOCK_BYTES = 1 << 28  # most bytes for the blocks of all signals: 256 MiB
 PLANTS_AT_A_TIME = 32  # so few that the random numbers stay in the cache of the CPU
 # Samples between two changes of the load disturbance, which is slow. The same samples change a
 # drifting plant (`dynamics.DRIFT_INTERVAL`).
 LOAD_INTERVAL = 10
-LOADS_AT_A_TIME = SAMPLES_AT_A_TIME // LOAD_INTERVAL  # load values generated together
 # Number of samples that no episode reaches, small enough to be added to another int64.
 UNLIMITED = 1 << 62
 ONLY_PLANT = np.zeros(1, np.intp)  # indices of the plants of an environment with one plant
@@ -58,25 +59,88 @@ def noise_polynomials(parameters: Parameters) -> dict[str, Sequence[float]]:
     return polynomials
 
 
-class Noise:
+class RandomSignal(ABC):
+    """A random signal of n plants, which is generated for a block of samples at a time.
+
+    Parameters
+    ----------
+    num_envs
+        Number n of plants.
+    samples
+        Number of samples in a block.
+    """
+
+    def __init__(self, num_envs: int, samples: int) -> None:
+        # A block of successive samples, degC, shape (samples, num_envs): one row per sample, so
+        # that the values for one sample of all plants are contiguous in memory.
+        self._block = np.zeros((samples, num_envs))
+        self._next_row = 0  # which `next` returns
+        self._streams: dict[int, EpisodeStream] = {}  # by index of the plant
+
+    def next(self) -> Values:
+        """Return the signal of all plants at the next sample, degC, shape (num_envs,).
+
+        The caller must not modify the returned array.
+        """
+        if self._next_row == len(self._block):
+            self._fill(np.arange(self._block.shape[1]), 0)
+            self._next_row = 0
+        values: Values = self._block[self._next_row]
+        self._next_row += 1
+        return values
+
+    def ahead(self) -> list[float]:
+        """Return the signal of a single plant at the samples of a block, degC, in a list."""
+        self._fill(ONLY_PLANT, 0)
+        values: list[float] = self._block[:, 0].tolist()
+        return values
+
+    def _begin(self, plants: Indices, streams: Sequence[EpisodeStream]) -> None:
+        """Begin an episode of the plants `plants`, which have the streams `streams`."""
+        self._streams.update(zip(plants.tolist(), streams, strict=True))
+        samples, num_envs = self._block.shape
+        if len(plants) == num_envs:
+            self._next_row = samples  # `next` then generates a block for all plants
+        else:  # the plants begin in the rest of the other plants' block
+            self._fill(plants, self._next_row)
+
+    def _fill(self, plants: Indices, first_row: int) -> None:
+        """Fill the rows of the block from `first_row` on, for the plants `plants`."""
+        samples = len(self._block) - first_row
+        for start in range(0, len(plants), PLANTS_AT_A_TIME):
+            chunk = plants[start : start + PLANTS_AT_A_TIME]
+            generators = [self._streams[i].generator for i in chunk.tolist()]
+            # A slice is much faster than indices, but needs plants without gaps.
+            has_gaps = chunk[-1] - chunk[0] >= len(chunk)
+            columns = chunk if has_gaps else slice(chunk[0], chunk[-1] + 1)
+            self._block[first_row:, columns] = self._generate(chunk, generators, samples).T
+
+    @abstractmethod
+    def _generate(
+        self, plants: Indices, generators: Sequence[np.random.Generator], samples: int
+    ) -> Values:
+        """Return the next `samples` samples of some plants, degC, shape (len(plants), samples).
+
+        `generators` holds the random number generator of each plant in `plants`. The next call
+        of `_generate` for a plant continues where this call ends.
+        """
+
+
+class Noise(RandomSignal):
     """The noise of n plants or of their transmitters, degC, which is 0 at sample k = 0.
 
     Parameters
     ----------
-    name
-        Name of the noise: "noise" for the coloured noise n(k) = C(z^-1) xi(k) of equation (28)
-        of the paper, with white noise xi; or "measurement_noise" for the noise of the
-        transmitter.
     c
         Coefficients of the polynomial that colours the white noise xi, from z^0 on.
     num_envs
         Number n of plants.
-    block
-        Number of samples of noise that are generated at a time.
+    samples
+        Number of samples in a block.
     """
 
-    def __init__(self, name: str, c: Sequence[float], num_envs: int, block: int) -> None:
-        self._name = name
+    def __init__(self, c: Sequence[float], num_envs: int, samples: int) -> None:
+        super().__init__(num_envs, samples)
         self._c = np.array(c)[:, np.newaxis, np.newaxis]  # two axes for plants and samples
         # Coefficients of C times the standard deviation of the white noise xi, degC, shape
         # (number of coefficients, num_envs, 1).
@@ -84,63 +148,36 @@ class Noise:
         # The latest values of the white noise xi of each plant, the oldest first, divided by
         # the standard deviation of xi.
         self._past_xi = np.zeros((num_envs, len(c) - 1))
-        # A block of successive samples of noise, degC: one row per sample, so that the values
-        # for one sample of all plants are contiguous in memory.
-        self._block = np.zeros((block, num_envs))
-        self._next_row = 0
 
     def reset(
-        self, plants: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
+        self, plants: Indices, streams: Sequence[EpisodeStream], variances: Values
     ) -> None:
-        """Begin an episode of the plants with the indices `plants`."""
-        deviations = np.sqrt(getattr(numbers, f"{self._name}_variance"))
+        """Begin an episode of the plants with the indices `plants`.
+
+        `variances` are those of the white noise xi, degC^2, shape (len(plants),), or shape ()
+        for one variance of all plants.
+        """
+        deviations = np.sqrt(variances)
         self._scaled_c[:, plants] = deviations[..., np.newaxis] * self._c
         self._past_xi[plants] = 0.0
-        self._streams = streams
-        for i in plants.tolist():
-            getattr(streams[i], self._name).next_episode()
-        if len(plants) == len(self._past_xi):
-            self._next_row = len(self._block)  # `next` then generates a block for all plants
-        else:  # the plants begin in the rest of the other plants' block
-            self._fill(plants, self._next_row)
+        for stream in streams:
+            stream.next_episode()
+        self._begin(plants, streams)
 
-    def next(self) -> Values:
-        """Return the noise of all plants at the next sample, degC, shape (num_envs,).
-
-        The caller must not modify the returned array.
-        """
-        if self._next_row == len(self._block):
-            self._fill(np.arange(len(self._past_xi)), 0)
-            self._next_row = 0
-        noise: Values = self._block[self._next_row]
-        self._next_row += 1
-        return noise
-
-    def ahead(self) -> list[float]:
-        """Return the noise of a single plant at the samples of a new block, degC, in a list."""
-        self._fill(ONLY_PLANT, 0)
-        noise: list[float] = self._block[:, 0].tolist()
-        return noise
-
-    def _fill(self, plants: Indices, first_row: int) -> None:
-        """Fill the rows of the noise block from `first_row` on, for the plants `plants`."""
+    def _generate(
+        self, plants: Indices, generators: Sequence[np.random.Generator], samples: int
+    ) -> Values:
         order = len(self._c) - 1
-        samples = len(self._block) - first_row
-        for start in range(0, len(plants), PLANTS_AT_A_TIME):
-            chunk = plants[start : start + PLANTS_AT_A_TIME]
-            xi = np.empty((len(chunk), order + samples))
-            xi[:, :order] = self._past_xi[chunk]
-            for i, new_xi in zip(chunk.tolist(), xi[:, order:], strict=True):
-                getattr(self._streams[i], self._name).generator.standard_normal(out=new_xi)
-            self._past_xi[chunk] = xi[:, samples:]
-            # A slice is much faster than indices, but needs plants without gaps.
-            has_gaps = chunk[-1] - chunk[0] >= len(chunk)
-            columns = chunk if has_gaps else slice(chunk[0], chunk[-1] + 1)
-            c = self._scaled_c[:, columns]
-            noise = c[0] * xi[:, order:]
-            for lag, coefficient in enumerate(c[1:], start=1):
-                noise += coefficient * xi[:, order - lag : -lag]
-            self._block[first_row:, columns] = noise.T
+        xi = np.empty((len(plants), order + samples))
+        xi[:, :order] = self._past_xi[plants]
+        for generator, new_xi in zip(generators, xi[:, order:], strict=True):
+            generator.standard_normal(out=new_xi)
+        self._past_xi[plants] = xi[:, samples:]
+        c = self._scaled_c[:, plants]
+        noise: Values = c[0] * xi[:, order:]
+        for lag, coefficient in enumerate(c[1:], start=1):
+            noise += coefficient * xi[:, order - lag : -lag]
+        return noise
 
 
 class SetPointLevels:
@@ -189,120 +226,121 @@ class SetPointLevels:
             self.values = list(setpoint)
             self.lengths = [1] * (len(self.values) - 1) + [UNLIMITED]
 
-    def sample(self, stream: EpisodeStream) -> tuple[float, int]:
+    def sample(self, generator: np.random.Generator) -> tuple[float, int]:
         """Return a random level, degC, and a random duration of this level, samples."""
-        level = stream.generator.uniform(-self.amplitude, self.amplitude)
-        length = stream.generator.integers(self.shortest, self.longest, endpoint=True)
+        level = generator.uniform(-self.amplitude, self.amplitude)
+        length = generator.integers(self.shortest, self.longest, endpoint=True)
         return level, int(length)
 
 
-class _HeldSignal(ABC):
-    """A signal of n plants whose values are constant between the times of changes.
-
-    The times at which the signal changes are counted in samples since the plants were created.
-
-    Attributes
-    ----------
-    present : ndarray of float64
-        Value of the signal of each plant, degC, shape (num_envs,), at the latest sample for
-        which `reset` or `next` returned the signal. After a call of `ahead`, `present` has no
-        meaning for other objects. Other objects must not modify the array `present`.
-    """
-
-    def __init__(self, num_envs: int) -> None:
-        self.present = np.zeros(num_envs)
-        self._clock = 0  # the present time
-        self._change_times = np.zeros(num_envs, np.int64)  # of the next change of each plant
-        self._next_change_time = 0  # the earliest of these times
-
-    def next(self) -> Values:
-        """Return the signal of all plants at the next sample, degC, shape (num_envs,).
-
-        The caller must not modify the returned array.
-        """
-        self._clock += 1
-        if self._clock >= self._next_change_time:
-            self._make_changes()
-        return self.present
-
-    def _make_changes(self) -> None:
-        """Change the signal of each plant whose next change is at the present time."""
-        self._change(np.flatnonzero(self._change_times <= self._clock))
-        self._next_change_time = int(self._change_times.min())
-
-    @abstractmethod
-    def _change(self, plants: Indices) -> None:
-        """Change the signal of the plants `plants`, and move on the times of their changes."""
-
-
-class SetPoint(_HeldSignal):
-    """The set point y_d(k) of n plants, in degC.
+class RepeatedSetPoint:
+    """The set point y_d(k) of n plants, degC, if its levels are the same in every episode.
 
     Parameters
     ----------
-    parameters
-        The arguments of the environment.
+    levels
+        Levels of the set point and their durations, which are not random.
     num_envs
         Number n of plants.
     """
 
-    def __init__(self, parameters: Parameters, num_envs: int) -> None:
-        super().__init__(num_envs)
-        self._levels = SetPointLevels(parameters)
-        self._level_values = np.array(self._levels.values)
-        self._level_lengths = np.array(self._levels.lengths)
-        # Index of each plant's next level in `_level_values` and in `_level_lengths`; unused if
-        # levels are random.
-        self._places = np.zeros(num_envs, np.intp)
+    def __init__(self, levels: SetPointLevels, num_envs: int) -> None:
+        self._levels = np.array(levels.values)
+        self._ends = np.cumsum(levels.lengths)  # samples of a period at which the levels end
+        # Times in samples since the plants were created: the present time, the starts of the
+        # episodes, and the time at which the set point of any plant changes next.
+        self._clock = 0
+        self._starts = np.zeros(num_envs, np.int64)
+        self._next_change = 0
+        self._present = np.zeros(num_envs)
 
-    def reset(self, plants: Indices, streams: StreamsOfPlants) -> Values:
+    def reset(self, plants: Indices) -> Values:
         """Begin an episode of the plants `plants`, and return the set points y_d(0), degC."""
-        self._streams = streams
-        if self._levels.random:
-            for i in plants.tolist():
-                streams[i].setpoint.next_episode()
-        # The first level of the episode begins at the present sample.
-        self._places[plants] = 0
-        self._change_times[plants] = self._clock
-        self._make_changes()
-        return self.present[plants]
+        self._starts[plants] = self._clock
+        self._next_change = 0  # a time that has passed, so that `next` looks up the levels
+        return np.full(len(plants), self._levels[0])
+
+    def next(self) -> Values:
+        """Return the set points of all plants at the next sample, degC, shape (num_envs,).
+
+        The caller must not modify the returned array.
+        """
+        self._clock += 1
+        if self._clock >= self._next_change:
+            self._present, unchanged_samples = self._at(self._clock - self._starts)
+            self._next_change = self._clock + unchanged_samples
+        return self._present
 
     def ahead(self) -> list[float]:
         """Return the set points of a single plant at the next 600 samples, degC, in a list."""
-        level = self.present.item()
-        place = self._places.item()
-        # The number of coming samples whose level is known: until the level's next change.
-        known = self._change_times.item() - self._clock - 1
-        setpoints = [level] * min(known, SAMPLES_AT_A_TIME)
-        while known < SAMPLES_AT_A_TIME:
-            if self._levels.random:
-                level, length = self._levels.sample(self._streams[0].setpoint)
-            else:
-                level = self._levels.values[place]
-                length = self._levels.lengths[place]
-                place = (place + 1) % len(self._levels.values)
-            setpoints += [level] * min(length, SAMPLES_AT_A_TIME - known)
-            known += length
-        self.present[0] = level
-        self._places[0] = place
-        self._change_times[0] = self._clock + 1 + known
+        k = self._clock - self._starts + np.arange(1, SAMPLES_AT_A_TIME + 1)
         self._clock += SAMPLES_AT_A_TIME
+        setpoints: list[float] = self._at(k)[0].tolist()
         return setpoints
 
-    def _change(self, plants: Indices) -> None:
-        """Begin the next level of the set point of the plants with the indices `plants`."""
-        if self._levels.random:
-            for i in plants.tolist():
-                self.present[i], length = self._levels.sample(self._streams[i].setpoint)
-                self._change_times[i] += length
-        else:
-            places = self._places[plants]
-            self.present[plants] = self._level_values[places]
-            self._change_times[plants] += self._level_lengths[places]
-            self._places[plants] = (places + 1) % len(self._level_values)
+    def _at(self, k: NDArray[np.int64]) -> tuple[Values, int]:
+        """Return the set points at the samples k, and for how many samples all of them stay."""
+        k_in_period = k % self._ends[-1]  # after the last level, the first follows again
+        # The index of the level is the number of ends that a sample has reached.
+        indices = np.searchsorted(self._ends, k_in_period, side="right")
+        samples_left = self._ends[indices] - k_in_period
+        return self._levels[indices], int(samples_left.min())
 
 
-class Disturbance(_HeldSignal):
+class RandomSetPoint(RandomSignal):
+    """The set point y_d(k) of n plants, degC: random levels, each for a random time.
+
+    Parameters
+    ----------
+    levels
+        The distribution of levels and durations.
+    num_envs
+        Number n of plants.
+    samples
+        Number of samples in a block.
+    """
+
+    def __init__(self, levels: SetPointLevels, num_envs: int, samples: int) -> None:
+        super().__init__(num_envs, samples)
+        self._distribution = levels
+        # The latest level of each plant, degC, and the number of samples after the latest
+        # generated sample at which the level still holds. Lists, as single elements are used.
+        self._levels = [0.0] * num_envs
+        self._samples_left = [0] * num_envs
+
+    def reset(self, plants: Indices, streams: Sequence[EpisodeStream]) -> Values:
+        """Begin an episode of the plants `plants`, and return the set points y_d(0), degC."""
+        setpoints = np.empty(len(plants))
+        for place, (i, stream) in enumerate(zip(plants.tolist(), streams, strict=True)):
+            setpoints[place], length = self._distribution.sample(stream.next_episode())
+            self._levels[i] = setpoints[place].item()
+            self._samples_left[i] = length - 1  # without the sample k = 0
+        self._begin(plants, streams)
+        return setpoints
+
+    def _generate(
+        self, plants: Indices, generators: Sequence[np.random.Generator], samples: int
+    ) -> Values:
+        # The levels of one plant after the other, degC, and their durations, samples.
+        levels: list[float] = []
+        lengths: list[int] = []
+        for i, generator in zip(plants.tolist(), generators, strict=True):
+            known = self._samples_left[i]  # number of coming samples whose levels are known
+            levels.append(self._levels[i])
+            lengths.append(known)
+            while known < samples:
+                # Drawn singly, as arrays of levels and of durations have other random numbers.
+                level, length = self._distribution.sample(generator)
+                levels.append(level)
+                lengths.append(length)
+                known += length
+            self._levels[i] = levels[-1]
+            self._samples_left[i] = known - samples
+            lengths[-1] -= known - samples  # The last level goes on after these samples.
+        return np.repeat(levels, lengths).reshape(len(plants), samples)
+
+
+class Disturbance(RandomSignal):
     """The load disturbance w(k), degC: a level that jumps, plus a random walk.
 
     The load changes every 10 samples (`LOAD_INTERVAL`). At the start of an episode, the level
@@ -315,30 +353,30 @@ class Disturbance(_HeldSignal):
     ----------
     num_envs
         Number n of plants.
+    samples
+        Number of samples in a block.
     """
 
-    def __init__(self, num_envs: int) -> None:
-        super().__init__(num_envs)
+    def __init__(self, num_envs: int, samples: int) -> None:
+        super().__init__(num_envs, samples)
         self._amplitudes = np.zeros(num_envs)  # largest magnitude of a new level, degC
         self._jump_probabilities = np.zeros(num_envs)  # of a jump of the level
         self._largest_walk_steps = np.zeros(num_envs)  # largest step of the random walk, degC
-        # Level and random walk of the load, degC, at the last of the changes of load that have
-        # been generated.
+        # Level and random walk of the load at the latest generated sample, degC, and the number
+        # of samples since the load has changed.
         self._last_levels = np.zeros(num_envs)
         self._last_walks = np.zeros(num_envs)
-        # The load after each of the next changes of each plant, generated ahead, degC.
-        self._loads = np.zeros((num_envs, LOADS_AT_A_TIME))
-        self._next_columns = np.zeros(num_envs, np.intp)  # columns of the next loads
+        self._ages = np.zeros(num_envs, np.intp)
 
     def reset(
-        self, plants: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
+        self, plants: Indices, streams: Sequence[EpisodeStream], numbers: PlantNumbers[Values]
     ) -> None:
         """Begin an episode of the plants with the indices `plants`, with a load of 0.
 
-        Before this call, the parameter values of the plants must have been sampled: parameter
-        values and load use the same random number stream, in this order.
+        Before this call, the parameter values `numbers` of these plants must have been sampled,
+        which moves `streams` to the episode: parameter values and load use the same random
+        number stream, in this order.
         """
-        self._streams = streams
         self._amplitudes[plants] = numbers.disturbance_amplitude
         self._jump_probabilities[plants] = LOAD_INTERVAL / numbers.disturbance_interval
         # A step of the walk that is uniform within +-h has the variance h^2 / 3.
@@ -346,109 +384,96 @@ class Disturbance(_HeldSignal):
         self._largest_walk_steps[plants] = np.sqrt(squared_steps)
         self._last_levels[plants] = 0.0
         self._last_walks[plants] = 0.0
-        self._next_columns[plants] = LOADS_AT_A_TIME  # no load has been generated yet
-        self.present[plants] = 0.0
-        self._change_times[plants] = self._clock + LOAD_INTERVAL
-        self._next_change_time = int(self._change_times.min())
-        # Loads of a single plant at coming samples, which the next call of `ahead` returns
-        # first: 0 at the samples before the first change.
-        self._known_loads = [0.0] * (LOAD_INTERVAL - 1)
+        self._ages[plants] = 0
+        self._begin(plants, streams)
 
-    def ahead(self) -> list[float]:
-        """Return the load of a single plant at the next 600 samples, degC, in a list."""
-        self._generate(ONLY_PLANT)
-        # 600 further loads, of which the last 9 remain for the next call.
-        new_loads: list[float] = np.repeat(self._loads[0], LOAD_INTERVAL).tolist()
-        loads = self._known_loads + new_loads
-        self._known_loads = loads[SAMPLES_AT_A_TIME:]
-        return loads[:SAMPLES_AT_A_TIME]
+    def _generate(
+        self, plants: Indices, generators: Sequence[np.random.Generator], samples: int
+    ) -> Values:
+        ages = self._ages[plants]
+        changes = (ages + samples) // LOAD_INTERVAL  # of the load of each plant
+        self._ages[plants] = (ages + samples) % LOAD_INTERVAL
+        # For each change, three random numbers from 0 to 1: one for the step of the walk, one
+        # that decides whether the level jumps, and one for the new level. The last change of
+        # some plants may be one too many, and is not used.
+        uniform = np.zeros((len(plants), changes.max(), 3))
+        draws = zip(generators, uniform, changes.tolist(), strict=True)
+        for generator, uniform_of_plant, count in draws:
+            generator.random(out=uniform_of_plant[:count])
+        walks = self._walks(plants, uniform[..., 0])
+        levels = self._levels(plants, uniform[..., 1], uniform[..., 2])
+        rows = np.arange(len(plants))
+        self._last_walks[plants] = walks[rows, changes]
+        self._last_levels[plants] = levels[rows, changes]
+        # The load at samples from the latest change on, which was `ages` samples ago.
+        loads = np.repeat(levels + walks, LOAD_INTERVAL, axis=1)
+        firsts = (ages + 1).tolist()
+        return np.stack([row[i : i + samples] for row, i in zip(loads, firsts, strict=True)])
 
-    def _change(self, plants: Indices) -> None:
-        """Set the load of the plants with the indices `plants` to the next value."""
-        needs_loads = self._next_columns[plants] == LOADS_AT_A_TIME
-        self._generate(plants[needs_loads])
-        columns = self._next_columns[plants]  # 0 where loads were generated
-        self.present[plants] = self._loads[plants, columns]
-        self._next_columns[plants] = columns + 1
-        self._change_times[plants] += LOAD_INTERVAL
+    def _walks(self, plants: Indices, uniform: Values) -> Values:
+        """Return the random walks of some plants, degC: the last ones, and after each change.
 
-    def _generate(self, plants: Indices) -> None:
-        """Generate the next 60 values of the load of the plants with the indices `plants`."""
-        for start in range(0, len(plants), PLANTS_AT_A_TIME):
-            chunk = plants[start : start + PLANTS_AT_A_TIME]
-            # For each load, three random numbers from 0 to 1: one for the step of the walk, one
-            # that decides whether the level jumps, and one for the new level.
-            uniform = np.empty((len(chunk), LOADS_AT_A_TIME, 3))
-            for i, uniform_of_plant in zip(chunk.tolist(), uniform, strict=True):
-                self._streams[i].plant.generator.random(out=uniform_of_plant)
-            walks = self._continue_walks(chunk, uniform[..., 0])
-            levels = self._continue_levels(chunk, uniform[..., 1], uniform[..., 2])
-            self._loads[chunk] = levels + walks
-        self._next_columns[plants] = 0
-
-    def _continue_walks(self, plants: Indices, uniform: Values) -> Values:
-        """Return the random walks of some plants at the next changes of the load, degC.
-
-        `uniform` holds random numbers from 0 to 1, one for each step of a random walk.
-        `uniform` and the returned walks have the shape (len(plants), number of changes of the
-        load).
+        `uniform` holds random numbers from 0 to 1, one for each step of a random walk, shape
+        (len(plants), number of changes of the load). The returned walks have one column more.
         """
         steps = (2.0 * uniform - 1.0) * self._largest_walk_steps[plants, np.newaxis]
-        last_walks = self._last_walks[plants, np.newaxis]
-        walks: Values = np.hstack((last_walks, steps)).cumsum(axis=1)[:, 1:]
-        self._last_walks[plants] = walks[:, -1]
+        walks: Values = np.hstack((self._last_walks[plants, np.newaxis], steps)).cumsum(axis=1)
         return walks
 
-    def _continue_levels(
-        self, plants: Indices, jump_uniform: Values, level_uniform: Values
-    ) -> Values:
-        """Return the load levels of some plants at the next changes of the load, degC.
+    def _levels(self, plants: Indices, jump_uniform: Values, level_uniform: Values) -> Values:
+        """Return the load levels of some plants, degC: the last ones, and after each change.
 
         `jump_uniform` holds random numbers from 0 to 1 that decide whether the level jumps, and
-        `level_uniform` random numbers from 0 to 1 that decide the new level. `jump_uniform`,
-        `level_uniform` and the returned levels have the shape (len(plants), number of changes
-        of the load).
+        `level_uniform` random numbers from 0 to 1 that decide the new level, both of shape
+        (len(plants), number of changes of the load). The returned levels have one column more.
         """
         jumps = jump_uniform < self._jump_probabilities[plants, np.newaxis]
         new_levels = (2.0 * level_uniform - 1.0) * self._amplitudes[plants, np.newaxis]
         # The level at a change is the level of the latest jump up to this change. Column 0 of
         # `candidates` is the last known level, which holds until the first jump.
         candidates = np.hstack((self._last_levels[plants, np.newaxis], new_levels))
-        columns_of_jumps = np.where(jumps, np.arange(1, jumps.shape[1] + 1), 0)
+        columns_of_jumps = np.zeros(candidates.shape, np.intp)
+        columns_of_jumps[:, 1:] = np.where(jumps, np.arange(1, candidates.shape[1]), 0)
         columns_of_latest_jumps = np.maximum.accumulate(columns_of_jumps, axis=1)
-        levels = np.take_along_axis(candidates, columns_of_latest_jumps, axis=1)
-        self._last_levels[plants] = levels[:, -1]
-        return levels
+        return np.take_along_axis(candidates, columns_of_latest_jumps, axis=1)
 
 
 class Signals(NamedTuple):
     """The external signals of n plants; a noise or load that is always 0 is None."""
 
-    setpoint: SetPoint
+    setpoint: RepeatedSetPoint | RandomSetPoint
     noise: Noise | None
     disturbance: Disturbance | None
     measurement_noise: Noise | None
 
     @classmethod
     def of(
-        cls, parameters: Parameters, num_envs: int = 1, block: int = SAMPLES_AT_A_TIME
+        cls, parameters: Parameters, num_envs: int = 1, episode_length: int = UNLIMITED
     ) -> Signals:
         """Return the signals of `num_envs` plants with the arguments `parameters`.
 
-        `block` is the number of samples of noise that are generated at a time.
+        `episode_length` is the number of samples after which an episode is truncated.
         """
-        noises: dict[str, Noise] = {}
-        for name, c in noise_polynomials(parameters).items():
-            noises[name] = Noise(name, c, num_envs, block)
+        levels = SetPointLevels(parameters)
+        polynomials = noise_polynomials(parameters)
+        blocks = levels.random + parameters.is_disturbed + len(polynomials)
+        samples = _block_samples(blocks * num_envs, episode_length)
+        setpoint: RepeatedSetPoint | RandomSetPoint = RepeatedSetPoint(levels, num_envs)
+        if levels.random:
+            setpoint = RandomSetPoint(levels, num_envs, samples)
+        noises = {name: Noise(c, num_envs, samples) for name, c in polynomials.items()}
         return cls(
-            setpoint=SetPoint(parameters, num_envs),
+            setpoint=setpoint,
             noise=noises.get("noise"),
-            disturbance=Disturbance(num_envs) if parameters.is_disturbed else None,
+            disturbance=Disturbance(num_envs, samples) if parameters.is_disturbed else None,
             measurement_noise=noises.get("measurement_noise"),
         )
 
     def reset(
-        self, plants: Indices, streams: StreamsOfPlants, numbers: PlantNumbers[Values]
+        self,
+        plants: Indices,
+        streams: Sequence[RandomStreams],
+        numbers: PlantNumbers[Values],
     ) -> Values:
         """Begin an episode of some plants, and return the set points y_d(0), degC.
 
@@ -460,21 +485,28 @@ class Signals(NamedTuple):
         plants
             Indices of the plants that begin an episode.
         streams
-            Random number streams of all plants, by index of the plant.
+            Random number streams of these plants.
         numbers
-            Parameter values of the plants that begin an episode: arrays of shape
-            (len(plants),), or of shape () for a value that all plants share.
+            Parameter values of these plants: arrays of shape (len(plants),), or of shape () for
+            a value that all plants share.
         """
-        for signal in (self.noise, self.disturbance, self.measurement_noise):
-            if signal is not None:
-                signal.reset(plants, streams, numbers)
-        return self.setpoint.reset(plants, streams)
+        if self.noise is not None:
+            self.noise.reset(plants, [s.noise for s in streams], numbers.noise_variance)
+        if self.disturbance is not None:
+            self.disturbance.reset(plants, [s.plant for s in streams], numbers)
+        if self.measurement_noise is not None:
+            variances = numbers.measurement_noise_variance
+            noise_streams = [s.measurement_noise for s in streams]
+            self.measurement_noise.reset(plants, noise_streams, variances)
+        if isinstance(self.setpoint, RepeatedSetPoint):
+            return self.setpoint.reset(plants)
+        return self.setpoint.reset(plants, [s.setpoint for s in streams])
 
     def ahead(self) -> list[tuple[float, ...]]:
         """Return all signals of a single plant at the next 600 samples, one tuple per sample.
 
         Each tuple holds set point y_d, noise n, load w and measurement noise at a sample, in
-        degC. `ahead` needs signals that were made with the default `block` of 600 samples.
+        degC. `ahead` needs signals of one plant without a limit of the episodes.
         """
         columns: list[list[float]] = []
         for signal in self:
@@ -483,3 +515,16 @@ class Signals(NamedTuple):
             else:
                 columns.append(signal.ahead())
         return list(zip(*columns, strict=True))
+
+
+def _block_samples(values_per_sample: int, episode_length: int) -> int:
+    """Return the number of samples in a block, at most 600 (`SAMPLES_AT_A_TIME`).
+
+    The blocks of an episode end at or shortly after the end of the episode, so that few random
+    numbers are drawn in vain. Where the blocks of many plants would need more memory than 256
+    MiB (`BLOCK_BYTES`), the blocks are shorter, which is slower.
+    """
+    affordable = BLOCK_BYTES // (8 * max(1, values_per_sample))
+    most_samples = max(1, min(SAMPLES_AT_A_TIME, affordable))
+    blocks_per_episode = -(-episode_length // most_samples)  # rounded up
+    return -(-episode_length // blocks_per_episode)
