@@ -51,7 +51,7 @@ assert mptc_gym.__version__ == installed.version
 changelog = Path(mptc_gym.__file__).with_name("CHANGELOG.md").read_text(encoding="utf-8")
 assert f"## {installed.version} (" in changelog  # with a date
 idle = mptc_gym.evaluate(lambda observations: 0.0 * observations[:, :1], "MiddlePointHard-v0")
-assert abs(idle.score) < 1e-9 < idle.least_possible < idle.mean_error, idle
+assert abs(idle.score) < 1e-9 < idle.reference < idle.mean_error, idle
 for controller in DirectNNController(num_envs=5), PIController():
     scored = mptc_gym.evaluate(controller, episodes=5)
     assert scored.score > 0.5, scored

@@ -1,4 +1,4 @@
-"""Score a policy on episodes with fixed seeds, relative to the least possible error."""
+"""Score a policy on episodes with fixed seeds, relative to a reference error."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ EPISODES: Final = 100  # episodes of a score, unless the caller asks for another
 # Seed of the first validation episode. Validation episodes serve to choose among policies, so a
 # policy that is chosen on validation episodes is not chosen on the default episodes of a score.
 VALIDATION_SEED: Final = 5_000_000
-VALIDATION_EPISODES: Final = 200  # validation episodes with a known least possible error
+VALIDATION_EPISODES: Final = 200  # validation episodes with a known reference error
 SAMPLES: Final = 1200  # samples of an episode, unless the environment ends the episode earlier
-# Arguments of an environment that change observations or rewards, but not the least error that
-# a controller can have.
-_WITHOUT_EFFECT_ON_BOUNDS: Final = *INTERFACE, "reward", "error_scale", "move_weight"
+# Arguments of an environment that change observations or rewards, but not the error of an ideal
+# controller.
+_WITHOUT_EFFECT_ON_REFERENCE: Final = *INTERFACE, "reward", "error_scale", "move_weight"
 _RESAMPLES: Final = 2000  # number of bootstrap samples for the interval of a score
 _VALVE_IDLE: Final = (  # a note on episodes
     "the valve never moved: score the policy in the action form of its training, or choose "
@@ -71,23 +71,27 @@ class Evaluation:
         Seeds of the episodes.
     note : str
         Reasons why the score is missing and why the valve never moved; otherwise "".
-    least_possible : float or None
-        Least possible mean error, degC, averaged over the episodes: a lower bound for random
-        and constant set points, otherwise the lowest mean error if the plant has settled before
-        each set-point change and the change comes as a surprise. If the package does not know
-        the least possible error, the attributes `least_possible`, `multiple`, `score`,
-        `interval`, `least` and `scores` are None, and the attribute `note` says why.
-    multiple : float or None
-        The mean error of the policy divided by the least possible mean error.
+    reference : float or None
+        Reference error, degC, averaged over the episodes: the mean error of an ideal controller
+        that knows the plant and the present load, but not the future. If the package does not
+        know the reference error, the attributes `reference`, `ratio`, `score`, `interval`,
+        `references` and `scores` are None, and the attribute `note` says why.
+    ratio : float or None
+        The mean error of the policy divided by the reference error.
+    is_bound : bool
+        Whether it is proven that no controller without foresight has a smaller mean error than
+        the reference error, on average. If false, set points follow a timetable, and a policy
+        that has learnt the timetable can have a ratio below 1 and a score above 1; or the
+        reference error is unknown.
     score : float or None
-        Score of the policy: 0 for the mean error of a valve that never moves, 1 for the least
-        possible mean error.
+        Score of the policy: 0 for the mean error of a valve that never moves, 1 for the
+        reference error.
     interval : (float, float) or None
         95 % confidence interval of the score, from a bootstrap that resamples episodes.
-    least, scores : ndarray or None, shape (episodes,)
-        Least possible mean error of each episode, degC, and score of each episode. If nothing
-        but noise and load is random in the environment, the least possible mean error is an
-        expected value, the same for all episodes.
+    references, scores : ndarray or None, shape (episodes,)
+        Reference error of each episode, degC, and score of each episode. If nothing but noise
+        and load is random in the environment, the reference error is an expected value, the
+        same for all episodes.
     """
 
     env: str
@@ -97,11 +101,12 @@ class Evaluation:
     travels: Values
     seeds: range
     note: str = ""
-    least_possible: float | None = None
-    multiple: float | None = None
+    reference: float | None = None
+    ratio: float | None = None
+    is_bound: bool = False
     score: float | None = None
     interval: tuple[float, float] | None = None
-    least: Values | None = None
+    references: Values | None = None
     scores: Values | None = None
 
     def __repr__(self) -> str:
@@ -110,7 +115,7 @@ class Evaluation:
         # Equal episodes may differ by rounding errors.
         are_alike = bool(np.ptp(self.errors) < 1e-6)
         if self.interval is not None:
-            mean_error += f", {self.multiple:.2f} times the least possible"
+            mean_error += f", {self.ratio:.2f} times the reference"
             score = f"score {self.score:.3f}"
             low, high = self.interval
             if not are_alike:
@@ -192,7 +197,7 @@ def evaluate(
     --------
     >>> import mptc_gym, numpy as np
     >>> print(mptc_gym.evaluate(lambda observations: np.ones((len(observations), 1))))
-    MiddlePoint-v0: mean error 6.613 degC, 7.26 times the least possible; score -0.394; \
+    MiddlePoint-v0: mean error 6.613 degC, 7.26 times the reference; score -0.394; \
 valve travel 10 t/h; 100 episodes, all alike
 
     A model of Stable-Baselines3, on the plants of its training and on others:
@@ -208,13 +213,15 @@ valve travel 10 t/h; 100 episodes, all alike
     first = count("seed", seed, 0, 2**63 - 1)
     seeds = range(first, first + episodes)
     with opened(policy, env, episodes, arguments) as plants:
-        case = case_of(parameters_of(plants))  # without the arguments that change no bound
+        case = case_of(
+            parameters_of(plants)
+        )  # without the arguments that change no reference error
         # A user's code or wrapper may alter the episodes. Environments that are made from an id
         # without wrappers are one batch, which has no attribute `envs`.
         is_alterable = callable(env) or any("envs" in vars(layer) for layer in layers(plants))
         runs = _run(policy, plants, seeds, case, is_replayed=is_alterable)
-    bound = find_bound(case, runs.length, seeds)
-    notes = [bound.why_not, "" if runs.travels.any() else _VALVE_IDLE]
+    reference = find_reference(case, runs.length, seeds)
+    notes = [reference.why_not, "" if runs.travels.any() else _VALVE_IDLE]
     evaluation = Evaluation(
         env=_name_of(case),
         mean_error=float(runs.errors.mean()),
@@ -223,10 +230,11 @@ valve travel 10 t/h; 100 episodes, all alike
         travels=runs.travels,
         seeds=seeds,
         note="; ".join(note for note in notes if note),
+        is_bound=reference.is_bound,
     )
-    if bound.least is None:
+    if reference.errors is None:
         return evaluation
-    return _with_scores(evaluation, bound.least, _idle_errors(case, seeds))
+    return _with_scores(evaluation, reference.errors, _idle_errors(case, seeds))
 
 
 class _Runs(NamedTuple):
@@ -287,68 +295,77 @@ def _measure(samples: Iterator[Sample], n: int) -> _Runs:
     return _Runs(total_errors / length, travels, length)
 
 
-class Bound(NamedTuple):
-    """The least possible mean error of each episode, or the reason why it is unknown."""
+class StoredReference(NamedTuple):
+    """The stored reference error of each episode, or the reason why none is stored."""
 
-    least: Values | None  # least possible mean error of each episode, degC, shape (episodes,)
-    why_not: str = ""  # why `least` is None
+    errors: Values | None  # reference error of each episode, degC, shape (episodes,)
+    is_bound: bool = False  # `Evaluation.is_bound`
+    why_not: str = ""  # why `errors` is None
 
 
-def find_bound(parameters: Parameters, length: int, seeds: range) -> Bound:
-    """Return the least possible mean errors for the seeds, or why they are unknown."""
-    least_by_seed = _read_bounds().get(case_of(parameters))
-    if least_by_seed is None:
-        return Bound(
+def find_reference(parameters: Parameters, length: int, seeds: range) -> StoredReference:
+    """Return the stored reference errors for the seeds, or why none are stored."""
+    case = _stored_cases().get(case_of(parameters))
+    if case is None:
+        return StoredReference(
             None,
-            "bounds are kept for the presets alone, without other arguments of the plant; in a "
-            "checkout, python -m benchmarks.bounds --help says how to compute others",
+            why_not="reference errors are kept for the presets alone, without other arguments "
+            "of the plant; in a checkout, python -m benchmarks.bounds --help says how to "
+            "compute others",
         )
     if length != SAMPLES:
-        return Bound(
+        return StoredReference(
             None,
-            f"bounds are kept for episodes of {SAMPLES:,} samples, not of {length:,}: leave "
-            "max_episode_steps as it is",
+            why_not=f"reference errors are kept for episodes of {SAMPLES:,} samples, not of "
+            f"{length:,}: leave max_episode_steps as it is",
         )
-    for first, least in least_by_seed.items():
-        if len(least) == 1:  # for all seeds, as only noise and load are random
-            return Bound(np.repeat(least, len(seeds)))
-        if first <= seeds.start and seeds.stop <= first + len(least):
-            return Bound(least[seeds.start - first : seeds.stop - first])
-    seeds_with_bounds = [
-        f"{first:,} to {first + len(least) - 1:,}" for first, least in least_by_seed.items()
+    for first, errors in case.errors_by_seed.items():
+        if len(errors) == 1:  # for all seeds, as only noise and load are random
+            return StoredReference(np.repeat(errors, len(seeds)), case.is_bound)
+        if first <= seeds.start and seeds.stop <= first + len(errors):
+            of_seeds = errors[seeds.start - first : seeds.stop - first]
+            return StoredReference(of_seeds, case.is_bound)
+    stored_seeds = [
+        f"{first:,} to {first + len(errors) - 1:,}"
+        for first, errors in case.errors_by_seed.items()
     ]
-    return Bound(
+    return StoredReference(
         None,
-        f"bounds of these plants are kept for seeds {' and '.join(seeds_with_bounds)}, not for "
-        f"{seeds.start:,} to {seeds.stop - 1:,}: choose seed and episodes among them",
+        why_not=f"reference errors of these plants are kept for seeds "
+        f"{' and '.join(stored_seeds)}, not for {seeds.start:,} to {seeds.stop - 1:,}: choose "
+        "seed and episodes among them",
     )
 
 
-@cache
-def _read_bounds() -> dict[Parameters, dict[int, Values]]:
-    """Return the least possible mean errors in the file `bounds.json`, degC.
+class _StoredCase(NamedTuple):
+    """The reference errors of a case in the file `bounds.json`."""
 
-    The keys of the returned dict are plant arguments, in the form that `case_of` returns. The
-    values of the returned dict are dicts, which map the seed of a first episode to an array of
-    the least possible mean errors for successive seeds. If such an array has a single element,
-    the least possible mean error is the same for all seeds.
-    """
+    # Arrays of the reference errors for successive seeds, degC, by the first seed. If an array
+    # has a single element, the reference error is the same for all seeds.
+    errors_by_seed: dict[int, Values]
+    is_bound: bool  # `Evaluation.is_bound`
+
+
+@cache
+def _stored_cases() -> dict[Parameters, _StoredCase]:
+    """Return the cases in the file `bounds.json` by their arguments, as `case_of` returns."""
     text = resources.files("mptc_gym").joinpath("bounds.json").read_text(encoding="utf-8")
-    bounds = {}
+    cases = {}
     for record in json.loads(text)["cases"].values():
-        least_by_seed = {SEED: np.array(record["least"])}
-        if "validation_least" in record:
-            least_by_seed[VALIDATION_SEED] = np.array(record["validation_least"])
-        bounds[case_of(Parameters(**record["arguments"]))] = least_by_seed
-    return bounds
+        errors_by_seed = {SEED: np.array(record["reference"])}
+        if "validation_reference" in record:
+            errors_by_seed[VALIDATION_SEED] = np.array(record["validation_reference"])
+        case = _StoredCase(errors_by_seed, is_bound=record["kind"] != "surprise")
+        cases[case_of(Parameters(**record["arguments"]))] = case
+    return cases
 
 
 def case_of(parameters: Parameters) -> Parameters:
     """Return `parameters` with the default arguments of the observation and the reward.
 
-    Plants for which `case_of` returns equal arguments have the same least possible error.
+    Plants for which `case_of` returns equal arguments have the same reference error.
     """
-    defaults = {name: ARGUMENTS[name].default for name in _WITHOUT_EFFECT_ON_BOUNDS}
+    defaults = {name: ARGUMENTS[name].default for name in _WITHOUT_EFFECT_ON_REFERENCE}
     return replace(parameters, **defaults)
 
 
@@ -362,10 +379,10 @@ def _idle_errors(parameters: Parameters, seeds: range) -> Values:
     return _measure(samples, n).errors
 
 
-def _with_scores(evaluation: Evaluation, least: Values, idle_errors: Values) -> Evaluation:
-    """Return a copy of `evaluation` with the least possible errors and the scores."""
+def _with_scores(evaluation: Evaluation, references: Values, idle_errors: Values) -> Evaluation:
+    """Return a copy of `evaluation` with the reference errors and the scores."""
     gained = idle_errors - evaluation.errors
-    possible = idle_errors - least
+    possible = idle_errors - references
     n = len(gained)
     generator = np.random.default_rng(0)
     resampled_scores = []
@@ -375,10 +392,10 @@ def _with_scores(evaluation: Evaluation, least: Values, idle_errors: Values) -> 
     low, high = np.quantile(resampled_scores, (0.025, 0.975)).tolist()
     return replace(
         evaluation,
-        least_possible=float(least.mean()),
-        multiple=float(evaluation.errors.mean() / least.mean()),
+        reference=float(references.mean()),
+        ratio=float(evaluation.errors.mean() / references.mean()),
         score=float(gained.mean() / possible.mean()),
         interval=(low, high),
-        least=least,
+        references=references,
         scores=gained / possible,
     )

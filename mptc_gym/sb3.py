@@ -39,7 +39,7 @@ class ScoreCallback(BaseCallback):
     another episode, pass another set point, such as `setpoint_period=500`.
 
     The model's logger records the mean absolute error, degC, as `score/mean_error`, and, if the
-    least possible error is known, the score as `score/score`.
+    reference error is known, the score as `score/score`.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class ScoreCallback(BaseCallback):
         scored again.
     episodes
         Number of episodes in which the policy is scored each time. If plants or set points are
-        random, a score needs least possible errors, which are known for at most 200 episodes.
+        random, a score needs reference errors, which are known for at most 200 episodes.
     folder
         Folder in which the policy with the least mean error is kept as `best_model.zip`, with
         the statistics of a `VecNormalize` in `vecnormalize.pkl`; None to write no files.

@@ -11,9 +11,9 @@ from scipy import linalg, optimize, signal
 from agents.hedge import RandomSetpoint
 from benchmarks.bounds import __main__ as command
 from benchmarks.bounds.causal import SetPointLaw
-from benchmarks.bounds.least import least_possible
-from benchmarks.bounds.linear_program import plan, reference
+from benchmarks.bounds.linear_program import plan, surprised_plan
 from benchmarks.bounds.prediction import noise_variance
+from benchmarks.bounds.reference import reference_error
 from benchmarks.bounds.unknown import error_bounds, load_changes
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.linear import LinearModel
@@ -54,7 +54,7 @@ def least_error_sum(level, samples, **arguments):
     """Return the least sum of |e| after a set-point change from rest at 0 to `level`, degC."""
     model = plant_of(samples + 110, **arguments)
     setpoint = np.full(samples, level)
-    return reference(model, error_bounds(model), setpoint).errors.sum()
+    return surprised_plan(model, error_bounds(model), setpoint).errors.sum()
 
 
 def test_a_dead_zone_makes_0_a_flow_within_limits_that_exclude_it():
@@ -122,7 +122,7 @@ class TestProgramme:
             "time_constant_drift": 1.5, "drift_samples": 300, "time_constant_factor": 0.8,
         }  # fmt: skip
         case = {"setpoint": setpoint.tolist(), **arguments}
-        least = least_possible(samples=300, kind="preview", **case)
+        reference = reference_error(samples=300, kind="preview", **case)
         error, flow = best_plan([*setpoint, 6.0], **arguments)
         assert flow.min() == pytest.approx(-12.0)
         actions = iter(action_from_command(flow, -12.0, 6.0))
@@ -131,9 +131,11 @@ class TestProgramme:
         of_run = np.abs(setpoint - runs.output[:, 0])
         np.testing.assert_allclose(of_run, error[:-1], atol=1e-4)
         run_errors = mean_error(runs)
-        assert run_errors[0] == pytest.approx(least.value, rel=1e-4)
-        assert not beats(run_errors * (1 + 1e-4), least)
-        assert beats(run_errors, replace(least, value=1.03 * least.value, episodes=(0.0, 0.0)))
+        assert run_errors[0] == pytest.approx(reference.value, rel=1e-4)
+        assert not beats(run_errors * (1 + 1e-4), reference)
+        assert beats(
+            run_errors, replace(reference, value=1.03 * reference.value, episodes=(0, 0))
+        )
 
 
 class TestUnknown:
@@ -235,7 +237,7 @@ class TestCausal:
     def test_no_controller_beats_it_and_it_is_tighter_than_that_with_preview(self):
         arguments = {"setpoint": "random", "dead_zone": 0.0}
         kinds = {
-            kind: least_possible(samples=400, kind=kind, episodes=4, **arguments)
+            kind: reference_error(samples=400, kind=kind, episodes=4, **arguments)
             for kind in ("preview", "causal")
         }
         run_errors = errors(CONTROLLERS["mpc"], 4, 400, **arguments)
@@ -244,13 +246,13 @@ class TestCausal:
         assert run_errors.mean() < 1.3 * kinds["causal"].value
 
 
-class TestLeastPossible:
+class TestReferenceError:
     def test_score(self):
-        least = least_possible(samples=600, setpoint=5.0)
-        idle = least.idle.value
-        scores = least.score([idle, least.value, (idle + least.value) / 2])
+        reference = reference_error(samples=600, setpoint=5.0)
+        idle = reference.idle.value
+        scores = reference.score([idle, reference.value, (idle + reference.value) / 2])
         assert scores == pytest.approx([0.0, 1.0, 0.5])
-        hopeless = least_possible(samples=10, setpoint=5.0)
+        hopeless = reference_error(samples=10, setpoint=5.0)
         with pytest.raises(ValueError, match="a score needs an idle-valve error above"):
             hopeless.score(1.0)
 
@@ -259,10 +261,10 @@ class TestLeastPossible:
             "kind must be one of": {"kind": "best"},
             "not random, got 'causal' for the set point 'square'": {"kind": "causal"},
             "delay must be": {"delay": -1},
-            "must be held until": {"kind": "reference", "setpoint_period": 100},
+            "must be held until": {"kind": "surprise", "setpoint_period": 100},
         }.items():
             with pytest.raises(ValueError, match=message):
-                least_possible(**{"samples": 600, **arguments})
+                reference_error(**{"samples": 600, **arguments})
 
 
 def test_it_gains_where_levels_are_short(monkeypatch):
@@ -282,13 +284,14 @@ class TestPredictiveController:
         ],
     )
     def test_it_expects_the_load_to_stay(self, load):
-        least = least_possible(samples=600, **load).value
-        assert least < errors(CONTROLLERS["mpc"], 20, 600, **load).mean() < 1.1 * least
+        reference = reference_error(samples=600, **load).value
+        mpc_error = errors(CONTROLLERS["mpc"], 20, 600, **load).mean()
+        assert reference < mpc_error < 1.1 * reference
 
     @pytest.mark.parametrize("plant", [{}, {"gain_factor": 1.3, "time_constant_factor": 0.8}])
     def test_it_reaches_the_limit_without_noise(self, plant):
         case = {"samples": 600, "setpoint": 5.0, **plant}
-        limit = least_possible(kind="reference", **case).value
+        limit = reference_error(kind="surprise", **case).value
         (error,) = mean_error(run_mpc(1, **case))
         assert limit * (1 - 1e-4) <= error <= 1.02 * limit
 

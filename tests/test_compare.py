@@ -14,10 +14,10 @@ import pandas as pd
 import pytest
 
 from agents import PIController
-from benchmarks.bounds.least import least_possible
+from benchmarks.bounds import reference_error
 from benchmarks.compare import plots
 from benchmarks.compare.__main__ import main
-from benchmarks.compare.cases import bound_of, run_case
+from benchmarks.compare.cases import reference_of, run_case
 from benchmarks.compare.estimates import estimate, ranked
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
@@ -89,14 +89,13 @@ def some_runs(**errors):
 
 class TestEstimates:
     def test_by_hand(self):
-        bound = bound_of(SCENARIOS["constant"], 3, SEED)
-        least = bound.least
+        reference = reference_of(SCENARIOS["constant"], 3, SEED)
         rows = some_runs(nn=[[1.0, 2.0, 3.0]], ppo=[[0.5, 2.0, 2.0], [1.5, 2.0, 1.0]])
         rows = rows.assign(scenario="constant")
-        found = estimate(rows, [bound])
+        found = estimate(rows, {"constant": reference})
         nn, ppo_ = found.to_dict("records")
-        assert (nn["mean"].value, nn["limit"]) == (2.0, least.value)
-        assert nn["ratio"].value == pytest.approx(2.0 / least.value)
+        assert (nn["mean"].value, nn["reference"]) == (2.0, reference.value)
+        assert nn["ratio"].value == pytest.approx(2.0 / reference.value)
         assert ppo_["mean"].value == pytest.approx(1.5)
         assert ppo_["difference"].value == pytest.approx(-0.5)
         assert ppo_["improvement"].value == pytest.approx((1 + 0.5 + 1 + 0 + 0.5 + 1) / 6)
@@ -104,13 +103,15 @@ class TestEstimates:
         assert nn["mean"].low < nn["mean"].value < nn["mean"].high
 
     def test_a_score_by_hand_and_the_best_comes_first(self):
-        bounds = [bound_of(SCENARIOS[name], 1, SEED) for name in ("constant", "square")]
+        cases = "constant", "square"
+        references = {name: reference_of(SCENARIOS[name], 1, SEED) for name in cases}
         rows = []
-        for scenario, least in bounds:
-            half = (least.value + least.idle.value) / 2
-            errors = some_runs(pi=[[least.idle.value, half]], nn=[[least.value, half]])
-            rows.append(errors.assign(scenario=scenario.name))
-        scores = ranked(estimate(pd.concat(rows), bounds))
+        for name, reference in references.items():
+            idle = reference.idle.value
+            half = (reference.value + idle) / 2
+            errors = some_runs(pi=[[idle, half]], nn=[[reference.value, half]])
+            rows.append(errors.assign(scenario=name))
+        scores = ranked(estimate(pd.concat(rows), references))
         assert [*scores] == ["nn", "pi"]
         assert scores["nn"].value == pytest.approx(0.75)
         assert scores["pi"].value == pytest.approx(0.25)
@@ -163,12 +164,12 @@ class TestCompare:
         out = compared("--agents nn pi mpc --scenarios constant constant-noise --runs 3")
         for name in ("runs", "summary", "estimates"):
             assert_golden(out / f"{name}.csv", f"compare_{name}.csv")
-        limit = least_possible(samples=600, kind="reference", setpoint=5.0).value
+        reference = reference_error(samples=600, kind="surprise", setpoint=5.0).value
         error = pd.read_csv(out / "runs.csv").query("agent == 'pi'")["mae"].iloc[0]
         page, screen = (out / "report.md").read_text(), capsys.readouterr().out
-        assert f"{limit:.3f}" in page
+        assert f"{reference:.3f}" in page
         for text in (page, screen):
-            assert f"{error / limit:.2f}" in text
+            assert f"{error / reference:.2f}" in text
         # The best comes first.
         assert page.index("| MPC") < page.index("| NN (1992)") < page.index("| PI (1992)")
         for name in ("constant", "constant-noise", "scores"):
@@ -190,8 +191,8 @@ class TestCompare:
             assert list(row["seed"]) == list(found.seeds)
             np.testing.assert_allclose(row["mae"], found.errors, rtol=0, atol=1e-12)
             np.testing.assert_allclose(row["total_variation"], found.travels, atol=1e-9)
-            assert against["limit"] == pytest.approx(found.least_possible, abs=1e-12)
-            assert against["ratio"] == pytest.approx(found.multiple, abs=1e-12)
+            assert against["reference"] == pytest.approx(found.reference, abs=1e-12)
+            assert against["ratio"] == pytest.approx(found.ratio, abs=1e-12)
 
     @pytest.mark.usefixtures("undrawn")
     def test_the_example_of_the_page_and_a_bad_one_beside_it(
@@ -267,19 +268,16 @@ class TestCompare:
     @pytest.mark.parametrize(
         ("cases", "headings"),
         [
-            ("", "score square zone 7 noise const zone 7 noise load (t/h)"),
-            ("--presets", "score paper zone 7 noisy disturb. fouling random. hard (t/h)"),
+            ("", "square zone 7 noise const zone 7 noise load score (t/h)"),
+            ("--presets", "paper zone 7 noisy disturb. fouling random. hard score (t/h)"),
         ],
     )
     @pytest.mark.usefixtures("undrawn")
     def test_the_screen_has_one_narrow_table(
         self, cases, headings, compared, capsys, monkeypatch
     ):
-        constant = bound_of(SCENARIOS["constant"], 1, SEED)
-        monkeypatch.setattr(
-            "benchmarks.compare.cases.bound_of",
-            lambda scenario, *_: constant._replace(scenario=scenario),
-        )
+        constant = reference_of(SCENARIOS["constant"], 1, SEED)
+        monkeypatch.setattr("benchmarks.compare.cases.reference_of", lambda *_: constant)
         long = f"{30 * 'x'}=agents:PIController"
         compared(f"{cases} --agents pi-searched idle --runs 1 --agent {long}")
         *lines, _ = capsys.readouterr().out.splitlines()  # the last names the folder

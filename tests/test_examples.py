@@ -104,7 +104,7 @@ def test_a_data_set_is_replayed_and_scores_a_policy(tmp_path, monkeypatch, capsy
         assert np.array_equal(again["applied"], episode.infos["applied"][:-1])
         assert (episode.terminations.sum(), *episode.truncations.nonzero()[0]) == (0, 1199)
     error = -np.mean([episode.rewards for episode in dataset])
-    assert f"mean error {error:.3f} (least possible 1.1" in capsys.readouterr().out
+    assert f"mean error {error:.3f} (reference 1.1" in capsys.readouterr().out
     # Minari and `evaluate` give a policy the same score.
     network = PolicyNetwork.load(PRETRAINED / "ppo-hard-10000.npz")
     evaluation = evaluate(network, dataset.env_spec)

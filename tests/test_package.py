@@ -117,7 +117,7 @@ print(mptc_gym.evaluate(agents.PIController(), "MiddlePointNoisy-v0").mean_error
 import mptc_gym.torch_env
 """
     process = python("-OO", "-c", program)  # the option removes docstrings
-    # The least possible error is 1.6 degC, and the error of an idle valve 5 degC.
+    # The reference error is 1.6 degC, and the error of an idle valve 5 degC.
     assert 1.6 < float(process.stdout) < 5.0, process.stderr
     assert 'pip install "mptc_gym[torch]"' in process.stderr.splitlines()[-1]
 

@@ -7,7 +7,7 @@ output is in benchmarks/published/bounds_verified.txt.
 import numpy as np
 import pandas as pd
 
-from benchmarks.bounds.least import least_possible
+from benchmarks.bounds import reference_error
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.sections import on_screen
 from benchmarks.lib.statistics import student
@@ -76,17 +76,17 @@ def errors(controller, runs, samples, **arguments):
     return mean_error(controller.run(arguments, samples, runs, SEED))
 
 
-def beats(run_errors, least):
+def beats(run_errors, reference):
     """Return whether the mean errors of runs, degC, shape (runs,), are smaller than a bound.
 
     The errors are smaller if the confidence interval of the difference from the bound lies
     below 0. If each episode has its own bound, each run is compared with the bound of its
     episode.
     """
-    bounds = np.full(len(run_errors), least.value)
-    if len(least.episodes) == len(run_errors):
-        bounds = np.array(least.episodes)
-    return student(run_errors - bounds).high < -1e-6 * least.value
+    bounds = np.full(len(run_errors), reference.value)
+    if len(reference.episodes) == len(run_errors):
+        bounds = np.array(reference.episodes)
+    return student(run_errors - bounds).high < -1e-6 * reference.value
 
 
 def main(runs=RUNS):
@@ -95,12 +95,12 @@ def main(runs=RUNS):
     beaten = []
     for case, arguments in CASES.items():
         kind = "causal" if arguments.get("setpoint") == "random" else "preview"
-        least = least_possible(samples=SAMPLES, kind=kind, episodes=runs, **arguments)
-        row = {"case": case, "bound": f"{least.value:.3f}", "kind": least.kind}
+        reference = reference_error(samples=SAMPLES, kind=kind, episodes=runs, **arguments)
+        row = {"case": case, "bound": f"{reference.value:.3f}", "kind": reference.kind}
         for name, controller in CONTROLLERS.items():
             run_errors = errors(controller, runs, SAMPLES, **arguments)
             row[name] = f"{run_errors.mean():.3f}"
-            if beats(run_errors, least):
+            if beats(run_errors, reference):
                 beaten.append(f"{name}: {case}")
         rows.append(row)
     print(on_screen(pd.DataFrame(rows)))

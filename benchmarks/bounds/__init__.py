@@ -1,3 +1,3 @@
-"""Compute lower bounds of the mean error of every controller, and reference errors."""
+"""Compute reference errors, most of which are lower bounds of the mean error."""
 
-from benchmarks.bounds.least import least_possible as least_possible
+from benchmarks.bounds.reference import reference_error as reference_error

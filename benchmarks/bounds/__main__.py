@@ -1,12 +1,12 @@
-"""Print the least possible mean errors: `python -m benchmarks.bounds --help`."""
+"""Print the reference errors: `python -m benchmarks.bounds --help`."""
 
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from benchmarks.bounds.least import least_possible
-from benchmarks.bounds.linear_program import NoBoundError
+from benchmarks.bounds.linear_program import NoReferenceError
+from benchmarks.bounds.reference import reference_error
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.command import Count, command, options
 from benchmarks.lib.fan_out import FanOut
@@ -23,8 +23,8 @@ from mptc_gym.evaluation import (
     VALIDATION_SEED,
 )
 
-# Heading of the table's column for each kind of least possible error.
-HEADINGS = {"preview": "with preview", "causal": "without preview", "reference": "reference"}
+# Heading of the table's column for each kind of reference error.
+HEADINGS = {"preview": "with preview", "causal": "without preview", "surprise": "surprise"}
 # Explanation of each column of the table, by heading, in the order of the columns.
 COLUMNS = {
     "idle valve": "the error if the flow stays at 0 t/h.",
@@ -37,11 +37,11 @@ COLUMNS = {
         "bound exists only for random set points, because it is derived from the distribution "
         "of the set points."
     ),
-    "reference": (
+    "surprise": (
         "the least error of a controller that finds the plant settled at each set-point change "
-        "and does not expect the change. The reference is not a lower bound: a controller that "
+        "and does not expect the change. It is not a lower bound: a controller that "
         "knows the times of the changes can have a smaller error. If the set point never "
-        'changes, the reference equals the bound "with preview".'
+        'changes, the error equals the bound "with preview".'
     ),
     "MPC": (
         "the error of model predictive control, which knows the plant, but neither the load "
@@ -50,9 +50,9 @@ COLUMNS = {
 }
 INTERVALS = "Numbers in parentheses are 95 % confidence intervals over random episodes."
 
-# File of the package `mptc_gym` with the least possible errors of the package's presets.
+# File of the package `mptc_gym` with the reference errors of the package's presets.
 PACKAGE_FILE = ROOT / "mptc_gym" / "bounds.json"
-# Number of episodes whose least possible errors the package has. Published scores use
+# Number of episodes whose reference errors the package has. Published scores use
 # `EPISODES` episodes; with 20 more, a somewhat longer evaluation also has a score.
 PACKAGED_EPISODES = EPISODES + 20
 PACKAGED = PRESETS | {
@@ -64,7 +64,7 @@ PACKAGED = PRESETS | {
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Print the least possible mean error of each case.
+    """Print the reference error of each case, by each kind that the case has.
 
     A case is a set of arguments of the environment. By default, the cases are the cases of
     `python -m benchmarks.compare` and the presets of the environment.
@@ -73,13 +73,13 @@ class Options:
     mpc: Count | None = None
     """Number of runs of each case with model predictive control, whose mean error is added."""
     package: bool = False
-    """Instead of the table, write the file of bounds that ships with the package mptc_gym."""
+    """Instead of the table, write the reference errors that ship with the package mptc_gym."""
     fan_out: FanOut = field(default_factory=FanOut)
     plant: PlantOptions = field(default_factory=PlantOptions)
 
 
 def work(options: Options) -> None:
-    """Print a table of least possible mean errors, below an explanation of the columns.
+    """Print a table of reference errors, below an explanation of the columns.
 
     If tasks fail or the user interrupts the computation, the printed table has only the cases
     that are finished. With the option `--package`, write the file `mptc_gym/bounds.json`
@@ -110,15 +110,15 @@ def row(case: Scenario, mpc_runs: int | None) -> dict[str, str]:
 
     If `mpc_runs` is not None, the row has the error of so many runs of MPC.
     The returned text is "" for the column "without preview" if set points are not random, and
-    for the column "reference" if the set point changes before the plant has settled.
+    for the column "surprise" if the set point changes before the plant has settled.
     """
-    least = partial(least_possible, samples=case.samples, **case.arguments)
+    reference = partial(reference_error, samples=case.samples, **case.arguments)
     # Formatting an `Estimate`, as in f"{estimate:.4f}", adds the interval in parentheses.
-    cells = {"case": case.name, "idle valve": f"{least(kind='preview').idle:.4f}"}
+    cells = {"case": case.name, "idle valve": f"{reference(kind='preview').idle:.4f}"}
     for kind, heading in HEADINGS.items():
         cells[heading] = ""
-        with suppress(NoBoundError):
-            cells[heading] = f"{least(kind=kind):.4f}"
+        with suppress(NoReferenceError):
+            cells[heading] = f"{reference(kind=kind):.4f}"
     if mpc_runs:
         runs = ROSTER["mpc"].run(case.arguments, case.samples, mpc_runs, SEED)
         cells["MPC"] = f"{bootstrap(mean_error(runs), seed=0):.4f}"
@@ -151,20 +151,20 @@ def write_package(fan_out: FanOut) -> None:
 
 
 def packaged_case(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the least possible errors of a case for the file `mptc_gym/bounds.json`.
+    """Return the reference errors of a case for the file `mptc_gym/bounds.json`.
 
     `arguments` are the arguments of the environment that define the case. In the returned dict,
-    the list "least" has the least possible mean error of each evaluation episode, degC, or a
-    single number if all episodes have the same least possible error. If the least possible
-    error differs between episodes, the returned dict also has the list "validation_least": the
-    least possible mean error, degC, of each episode with which trained policies are selected.
+    the list "reference" has the reference error of each evaluation episode, degC, or a single
+    number if all episodes have the same reference error. If the reference error differs between
+    episodes, the returned dict also has the list "validation_reference": the reference error,
+    degC, of each episode with which trained policies are selected.
     """
-    least = partial(least_possible, samples=SAMPLES, **arguments)
-    published = least(seed=SEED, episodes=PACKAGED_EPISODES)
-    entry = {"arguments": arguments, "kind": published.kind, "least": published.episodes}
+    reference = partial(reference_error, samples=SAMPLES, **arguments)
+    published = reference(seed=SEED, episodes=PACKAGED_EPISODES)
+    entry = {"arguments": arguments, "kind": published.kind, "reference": published.episodes}
     if len(published.episodes) > 1:
-        validation = least(seed=VALIDATION_SEED, episodes=VALIDATION_EPISODES)
-        entry["validation_least"] = validation.episodes
+        validation = reference(seed=VALIDATION_SEED, episodes=VALIDATION_EPISODES)
+        entry["validation_reference"] = validation.episodes
     return entry
 
 

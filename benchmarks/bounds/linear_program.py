@@ -20,8 +20,8 @@ TIME_LIMIT = 30.0  # s for each attempt; most programs take less than 1 s
 # A plant counts as settled if the flow stays within this fraction of the actuator's range for
 # the lag of the plant, the time from a flow to its first effect.
 SETTLED_FLOW_RANGE = 0.05
-# Number of samples by which the plan of a reference looks beyond a change of the set point, in
-# addition to the lag. With more samples, the references of the presets would be the same.
+# Number of samples by which a surprised plan looks beyond a change of the set point, in
+# addition to the lag. With more samples, the presets' reference errors would be the same.
 LOOKAHEAD = 60
 # Two small prices that select one of several plans with equal errors. With `SMALLEST_SLOPE`,
 # the least slope of an error bound, a plan ends at the set point. With `TRAVEL_PRICE`, the
@@ -31,10 +31,10 @@ SMALLEST_SLOPE = 0.001
 TRAVEL_PRICE = 4e-4
 
 
-class NoBoundError(ValueError):
-    """A case has no least possible error of the requested kind.
+class NoReferenceError(ValueError):
+    """A case has no reference error of the requested kind.
 
-    For example, a least possible error of the kind "reference" exists only if the plant settles
+    For example, a reference error of the kind "surprise" exists only if the plant settles
     before each change of the set point.
     """
 
@@ -281,12 +281,12 @@ def _solve(program: dict[str, Any]) -> Array:
 
 
 def price_of_travel(model: LinearModel, setpoint: Array) -> float:
-    """Return the price of valve travel in the plan of a reference, degC per t/h."""
+    """Return the price of valve travel in a surprised plan, degC per t/h."""
     low, high = model.limits
     return TRAVEL_PRICE * float(np.abs(setpoint).max()) / (high - low)
 
 
-def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
+def surprised_plan(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
     """Return the plan of a controller that never expects another change of the set point.
 
     At each change of the set point, the controller chooses the flows that are best if the set
@@ -308,7 +308,7 @@ def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
 
     Raises
     ------
-    NoBoundError
+    NoReferenceError
         If `setpoint` changes before the plant has settled.
     RuntimeError
         If no solver solves a linear program within `TIME_LIMIT` seconds.
@@ -333,8 +333,8 @@ def reference(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> Plan:
         is_long = stop - start >= model.lag
         has_settled = is_long and flow_range <= SETTLED_FLOW_RANGE * (high - low)
         if not (is_last or has_settled):
-            raise NoBoundError(
-                "setpoint must be held until the plant has settled for a reference to exist, "
+            raise NoReferenceError(
+                "setpoint must be held until the plant has settled "
                 f"got a set point that is held for {stop - start} samples"
             )
     return Plan(errors, flow)

@@ -68,7 +68,7 @@ def work(options: Options) -> None:
     If a task fails or the user interrupts the comparison, the results of the controllers that
     have finished are written before an error is raised.
     """
-    from benchmarks.compare.cases import Bound, Result, bound_of, run_case
+    from benchmarks.compare.cases import Result, reference_of, run_case
     from benchmarks.compare.report import write
 
     chosen = choose("--agents", options.agents, ROSTER) | own_controllers(options.agent)
@@ -81,18 +81,32 @@ def work(options: Options) -> None:
         scenarios={name: vars(scenario) for name, scenario in scenarios.items()},
     )
     folder = new_folder(options.out, folder_name, provenance)
+    task_of_reference = {case: f"reference error of {case}" for case in scenarios}
     tasks: dict[str, Any] = {}
     for case, scenario in scenarios.items():
-        tasks[f"bounds of {case}"] = partial(bound_of, scenario, runs, seed)
+        tasks[task_of_reference[case]] = partial(reference_of, scenario, runs, seed)
     for name, controller in controllers.items():
         for case, scenario in scenarios.items():
             tasks[f"{name}, {case}"] = partial(run_case, scenario, controller, runs, seed)
     finished = options.fan_out.run(tasks, "compare")
-    outcomes = finished.results.values()
-    bounds = [outcome for outcome in outcomes if isinstance(outcome, Bound)]
-    results = [outcome for outcome in outcomes if isinstance(outcome, Result)]
+    references = {
+        case: finished.results[task]
+        for case, task in task_of_reference.items()
+        if task in finished.results
+    }
+    results = [item for item in finished.results.values() if isinstance(item, Result)]
     if results:
-        print(write(results, bounds, controllers, folder, provenance, note, finished.error))
+        text = write(
+            results,
+            scenarios,
+            references,
+            controllers,
+            folder,
+            provenance,
+            note,
+            finished.error,
+        )
+        print(text)
     if finished.error:
         raise finished.error
 

@@ -1,4 +1,4 @@
-"""Run a controller in one case, or compute the least possible error of the case.
+"""Run a controller in one case, or compute the reference error of the case.
 
 A scenario is a plant, a set point and a length of the runs. The error of a run is the mean of
 |e|, the absolute error, over the samples of the run. The functions of this module run in worker
@@ -10,11 +10,11 @@ import operator
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from benchmarks.bounds.least import LeastPossible, least_possible
+from benchmarks.bounds.reference import Reference, reference_error
 from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.statistics import percentiles
 from benchmarks.loop.linear import LinearController, LinearLoop, nominal
@@ -141,29 +141,22 @@ def responses_over_time(
     return columns
 
 
-class Bound(NamedTuple):
-    """The least possible error in a scenario."""
+def reference_of(scenario: Scenario, runs: int, seed: int) -> Reference:
+    """Return the reference error in a scenario, a mean over episodes.
 
-    scenario: Scenario
-    least: LeastPossible
-
-
-def bound_of(scenario: Scenario, runs: int, seed: int) -> Bound:
-    """Return the least possible error in a scenario, a mean over episodes.
-
-    As least possible errors take long to compute, the mean is over the first `runs` episodes,
-    but at most over `EPISODES` episodes. Episode i has the seed `seed + i`.
+    As reference errors take long to compute, the mean is over the first `runs` episodes, but at
+    most over `EPISODES` episodes. Episode i has the seed `seed + i`.
 
     Raises
     ------
     ValueError
-        If the error of an idle valve in `scenario` is not above the least possible error.
+        If the error of an idle valve in `scenario` is not above the reference error.
     """
     episodes = min(runs, EPISODES)
-    least = least_possible(
+    reference = reference_error(
         samples=scenario.samples, episodes=episodes, seed=seed, **scenario.arguments
     )
     # Without scores, a case cannot be reported. So the method is called here, where a
     # ValueError ends only the task of this case.
-    least.score(0.0)
-    return Bound(scenario, least)
+    reference.score(0.0)
+    return reference

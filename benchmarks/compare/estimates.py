@@ -1,7 +1,7 @@
-"""Estimate errors, error ratios and scores of controllers from their runs."""
+"""Estimate errors, ratios and scores of controllers from their runs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from benchmarks.compare.cases import Bound
+from benchmarks.bounds.reference import Reference
 from benchmarks.lib.statistics import Estimate, bootstrap, percentiles
 
 BOOTSTRAP_SEED = 0  # seed of the resampling for confidence intervals, not of an episode
 
 
-def estimate(runs: pd.DataFrame, bounds: Sequence[Bound]) -> pd.DataFrame:
+def estimate(runs: pd.DataFrame, references: Mapping[str, Reference]) -> pd.DataFrame:
     """Estimate the mean errors and the scores of controllers, with 95 % confidence intervals.
 
     The confidence intervals of a single run have no width.
@@ -26,10 +26,11 @@ def estimate(runs: pd.DataFrame, bounds: Sequence[Bound]) -> pd.DataFrame:
         Table with a row for each run, and the columns `scenario`, `agent` (the controller),
         `policy` (the number of the controller's member), `seed` and `mae` (the mean absolute
         error of the run, degC). The rows of a controller in a scenario are in the order of its
-        members, and of their seeds. The controller in the first row is the reference
-        controller, with which all other controllers are compared.
-    bounds : sequence of Bound
-        Least possible errors. A scenario that has none is left out of the result.
+        members, and of their seeds. All other controllers are compared with the controller in
+        the first row.
+    references : mapping
+        Reference error of each scenario by name. A scenario that has none is left out of the
+        result.
 
     Returns
     -------
@@ -37,34 +38,33 @@ def estimate(runs: pd.DataFrame, bounds: Sequence[Bound]) -> pd.DataFrame:
         Table with a row for each scenario and controller, and these columns in addition to
         `scenario` and `agent`:
 
-        - `limit`: the least possible error, degC;
+        - `reference`: the reference error, degC;
         - `mean`: the mean error over the runs, degC, an `Estimate`;
-        - `ratio`: the error ratio, which is `mean` divided by `limit`, an `Estimate`;
+        - `ratio`: `mean` divided by `reference`, an `Estimate`;
         - `scores`: an array with the score of each run, shape (members, runs);
         - `difference`: the mean over the runs of the controller's error minus the error of the
-          reference controller in the same run (the mean over its members), degC, an `Estimate`;
+          first controller in the same run (the mean over its members), degC, an `Estimate`;
         - `improvement`: the share of the runs in which the controller's error is smaller than
-          the error of the reference controller, an `Estimate`. A run in which both controllers
+          the error of the first controller, an `Estimate`. A run in which both controllers
           have equal errors counts as half a run.
     """
-    reference = runs["agent"].iloc[0]
+    first = runs["agent"].iloc[0]
     rows = []
-    for scenario, least in bounds:
-        name = scenario.name
+    for name, reference in references.items():
         errors_of = errors_by_agent(runs[runs["scenario"] == name])
         for agent, errors in errors_of.items():
             mean = bootstrap(errors, seed=BOOTSTRAP_SEED)
             row = {
                 "scenario": name,
                 "agent": agent,
-                "limit": least.value,
+                "reference": reference.value,
                 "mean": mean,
-                "ratio": mean.scaled(1 / least.value),
-                "scores": least.score(errors),
+                "ratio": mean.scaled(1 / reference.value),
+                "scores": reference.score(errors),
             }
-            if agent != reference and reference in errors_of:
-                reference_errors = errors_of[reference].mean(axis=0)
-                differences = errors - reference_errors
+            if agent != first and first in errors_of:
+                errors_of_first = errors_of[first].mean(axis=0)
+                differences = errors - errors_of_first
                 is_better = (differences < 0.0) + 0.5 * (differences == 0.0)
                 row["difference"] = bootstrap(differences, seed=BOOTSTRAP_SEED)
                 row["improvement"] = bootstrap(is_better, seed=BOOTSTRAP_SEED)

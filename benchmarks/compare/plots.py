@@ -1,6 +1,6 @@
 """Draw the pictures of a comparison of controllers.
 
-A score is 0 for an idle valve and 1 for the least possible error.
+A score is 0 for an idle valve and 1 for the reference error.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mptc_gym import Parameters
 # 1 would lie at infinity. A score beyond an end of the axis is drawn at the end.
 SCORE_TICKS = 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999
 SCORE_LABEL = (
-    "score: 0 for an idle valve, 1 for the least possible error\n"
+    "score: 0 for an idle valve, 1 for the reference error\n"
     "(axis logarithmic in 1 minus the score, to show small differences near 1)\n"
     "large marker and number: mean over all cases; small tick: one case"
 )

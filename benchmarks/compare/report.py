@@ -8,8 +8,9 @@ from typing import Any
 
 import pandas as pd
 
+from benchmarks.bounds.reference import Reference
 from benchmarks.compare import plots
-from benchmarks.compare.cases import Bound, Result
+from benchmarks.compare.cases import Result
 from benchmarks.compare.estimates import estimate, ranked, summarise, write_table
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.command import CommandError
@@ -19,19 +20,19 @@ from benchmarks.loop.scenarios import Scenario
 
 SCORE_TEXT = (
     "The error of a run is the mean of |e| over the samples, where e is the set point minus "
-    "the temperature. An idle valve keeps the flow at 0 t/h. The score says which share of the "
-    "way from the error of an idle valve to the least possible error a controller covers, as a "
-    "mean over all cases. The column of a case has the error ratio: the mean error divided by "
-    "the least possible error, so 1.00 is best. In parentheses are 95 % confidence intervals. "
-    "The valve travel is the sum of all changes of the applied flow in a run, as a mean over "
-    "all runs."
+    "the temperature. The reference error is the mean error of an ideal controller that knows "
+    "the plant and the present load, but not the future. The column of a case has the ratio: "
+    "the mean error divided by the reference error. The score says which share of the way from "
+    "the error of an idle valve, which keeps the flow at 0 t/h, to the reference error a "
+    "controller covers, as a mean over all cases. In parentheses are 95 % confidence "
+    "intervals. The valve travel is the sum of all changes of the applied flow in a run, as a "
+    "mean over all runs."
 )
-LEAST_TEXT = (
-    "The first row has the least possible error of a controller that does not know future set "
-    "points. The mark * means that the plant settles before each change of the set point, and "
-    "that the least possible error assumes that each change comes as a surprise. In a case "
-    "with the mark *, a controller that has learnt when the set point changes can have an "
-    "error ratio below 1.00."
+REFERENCE_TEXT = (
+    "The first row has the reference errors. The mark † means: it is proven that no controller "
+    "without foresight has a smaller error on average. In a case without the mark, set points "
+    "follow a timetable, and the ideal controller is surprised by each change. A controller "
+    "that has learnt the timetable can have a ratio below 1 and a score above 1."
 )
 COSTS_TEXT = (
     "The column 'prior knowledge' says what a controller knows about the plant before a run, "
@@ -50,7 +51,7 @@ PICTURES_TEXT = (
     "To stay readable, the pictures show only these controllers: {}. The file CASE.csv of a "
     "case has the temperature and the flow of all controllers."
 )
-SCREEN_TEXT = "score: 0 idle valve, 1 least possible error; cases: error / least possible error"
+SCREEN_TEXT = "cases: error / reference error; score: 0 idle valve, 1 reference error"
 LONGEST_LABEL = 16  # largest number of characters of a controller's label on the screen
 # Of more controllers than `MOST_PICTURED`, the pictures of responses over time show only users'
 # own controllers and `PICTURED`: those of the paper, a model-based and a trained controller.
@@ -66,12 +67,14 @@ class Comparison:
     ----------
     controllers : mapping
         Record of each controller by name.
-    bounds : sequence of Bound
-        The scenarios in the order of the tables, each with its least possible error.
+    scenarios : sequence of Scenario
+        The scenarios in the order of the tables.
+    references : mapping
+        Reference error of each of `scenarios` by name.
     results : sequence of Result
         Results of each controller in each scenario, from all tasks that have finished.
     runs : pandas.DataFrame
-        Table with a row for each run in the scenarios of `bounds`.
+        Table with a row for each run in `scenarios`.
     estimates : pandas.DataFrame
         Table with a row for each scenario and controller, from `estimates.estimate`.
     scores : mapping
@@ -79,7 +82,8 @@ class Comparison:
     """
 
     controllers: Mapping[str, ControllerSpec]
-    bounds: Sequence[Bound]
+    scenarios: Sequence[Scenario]
+    references: Mapping[str, Reference]
     results: Sequence[Result]
     runs: pd.DataFrame
     estimates: pd.DataFrame
@@ -88,7 +92,8 @@ class Comparison:
 
 def write(
     results: Sequence[Result],
-    bounds: Sequence[Bound],
+    scenarios: Mapping[str, Scenario],
+    references: Mapping[str, Reference],
     controllers: Mapping[str, ControllerSpec],
     folder: Path,
     provenance: Mapping[str, Any],
@@ -97,11 +102,12 @@ def write(
 ) -> str:
     """Write the CSV files, pictures and report of a comparison, and return text for the screen.
 
-    A scenario that is not in `bounds` is written to the CSV files, but not to the report.
-    `controllers` has the record of each controller by name, `provenance` is the provenance of
+    A scenario without a reference error is written to the CSV files, but not to the report.
+    `scenarios`, `references` and `controllers` have the scenario, the reference error and the
+    record of each controller by name, `provenance` is the provenance of
     the results, as `provenance_of` returns it, `note` is a sentence on controllers that are
     left out, or "", and `error` says which results are missing. The returned text has the
-    scores and error ratios, `note`, and the path of the files.
+    ratios and scores, `note`, and the path of the files.
     """
     tables = [pd.DataFrame(columns) for result in results for columns in result.runs]
     runs = pd.concat(tables, ignore_index=True)
@@ -112,18 +118,25 @@ def write(
         columns = [result.responses for result in results if result.scenario == name]
         responses[name] = pd.concat(map(pd.DataFrame, columns))
         responses[name].to_csv(folder / f"{name}.csv", index=False)
-    # The report has the scenarios with both results and least possible errors.
-    bounds = [bound for bound in bounds if bound.scenario.name in responses]
-    if not bounds:
-        return f"{note}\nNo report without a least possible error; data in {folder}/".strip()
-    reported_runs = runs[runs["scenario"].isin([bound.scenario.name for bound in bounds])]
-    estimates = estimate(reported_runs, bounds)
+    # The report has the scenarios with both results and reference errors.
+    reported = [
+        scenario
+        for name, scenario in scenarios.items()
+        if name in references and name in responses
+    ]
+    if not reported:
+        return f"{note}\nNo report without a reference error; data in {folder}/".strip()
+    references = {scenario.name: references[scenario.name] for scenario in reported}
+    reported_runs = runs[runs["scenario"].isin(references)]
+    estimates = estimate(reported_runs, references)
     # Arrays do not fit into the cells of a CSV file.
     write_table(folder / "estimates.csv", estimates.drop(columns="scores"))
     scores = ranked(estimates)
-    comparison = Comparison(controllers, bounds, results, reported_runs, estimates, scores)
+    comparison = Comparison(
+        controllers, reported, references, results, reported_runs, estimates, scores
+    )
     plots.plot_scores(scores, estimates, controllers, folder / "scores.png")
-    for scenario, _ in bounds:
+    for scenario in reported:
         rows = responses[scenario.name]
         rows = rows[rows["agent"].isin(pictured(rows["agent"].unique()))]
         case_runs = reported_runs[reported_runs["scenario"] == scenario.name]
@@ -131,9 +144,10 @@ def write(
         path = folder / f"{scenario.name}.png"
         plots.plot_responses(rows, errors, scenario, controllers, path)
     finished_cases = estimates["agent"].value_counts()
-    labels = [controllers[name].label for name in scores if finished_cases[name] < len(bounds)]
-    if labels:
-        missing = f"Scores over fewer cases, as results are missing: {', '.join(labels)}."
+    incomplete = [name for name in scores if finished_cases[name] < len(reported)]
+    if incomplete:
+        labels = ", ".join(controllers[name].label for name in incomplete)
+        missing = f"Scores over fewer cases, as results are missing: {labels}."
         note = f"{note} {missing}".strip()
     page = sections(comparison, note)
     write_report(folder, "Comparison of controllers", page, provenance, error)
@@ -151,8 +165,8 @@ def pictured(agents: Iterable[str]) -> list[str]:
 
 def sections(comparison: Comparison, note: str) -> list[Section]:
     """Return the sections of a comparison's report, with `note` in the first section."""
-    scenarios = [scenario for scenario, _ in comparison.bounds]
     table = score_table(comparison, format)
+    first_row = reference_table(comparison.references)
     cases_text = [CASES_TEXT]
     drawn = pictured(comparison.scores)
     if len(drawn) < len(comparison.scores):
@@ -160,26 +174,26 @@ def sections(comparison: Comparison, note: str) -> list[Section]:
         cases_text.append(PICTURES_TEXT.format(", ".join(labels)))
     return [
         Section(
-            "Score and error ratios",
-            [SCORE_TEXT, LEAST_TEXT, *filter(None, [note])],
-            pd.concat([least_table(comparison.bounds), table])[table.columns].fillna(""),
+            "Ratios and scores",
+            [SCORE_TEXT, REFERENCE_TEXT, *filter(None, [note])],
+            pd.concat([first_row, table])[table.columns].fillna(""),
             pictures={"scores.png": "The score of each controller, and its score in each case"},
         ),
         Section("What each controller knows and costs", [COSTS_TEXT], costs_table(comparison)),
         Section(
             "Cases",
             cases_text,
-            cases_table(scenarios),
+            cases_table(comparison.scenarios),
             pictures={
                 f"{scenario.name}.png": f"Temperature and flow over time: {scenario.title}"
-                for scenario in scenarios
+                for scenario in comparison.scenarios
             },
         ),
     ]
 
 
 def score_table(comparison: Comparison, text: Callable[[Estimate, str], str]) -> pd.DataFrame:
-    """Return a table of texts with the score of each controller and its error ratios.
+    """Return a table of texts with the ratios and the score of each controller.
 
     `text` is a function that converts an estimate to a text in a format such as ".2f". The
     controller with the highest score comes first.
@@ -187,28 +201,26 @@ def score_table(comparison: Comparison, text: Callable[[Estimate, str], str]) ->
     travels = comparison.runs.groupby(["agent", "scenario"])["total_variation"].mean()
     rows = []
     for agent, score in comparison.scores.items():
-        row = {"controller": comparison.controllers[agent].label, "score": text(score, ".3f")}
+        row = {"controller": comparison.controllers[agent].label}
         estimates = comparison.estimates[comparison.estimates["agent"] == agent]
         for name, ratio in zip(estimates["scenario"], estimates["ratio"], strict=True):
             row[name] = text(ratio, ".2f")
+        row["score"] = text(score, ".3f")
         row["travel (t/h)"] = f"{travels[agent].mean():,.0f}"
         rows.append(row)
-    names = [scenario.name for scenario, _ in comparison.bounds]
-    columns = ["controller", "score", *names, "travel (t/h)"]
+    columns = ["controller", *comparison.references, "score", "travel (t/h)"]
     return pd.DataFrame(rows, columns=columns).fillna("")
 
 
-def least_table(bounds: Sequence[Bound]) -> pd.DataFrame:
-    """Return a table of texts with one row, which has the least possible errors, degC.
+def reference_table(references: Mapping[str, Reference]) -> pd.DataFrame:
+    """Return a table of texts with one row, which has the reference error of each case, degC.
 
-    The mark * follows a least possible error of the kind "reference", which is the error for
-    set-point changes that come as a surprise: controllers that have learnt the times of the
-    changes can have a smaller error.
+    The mark † follows a reference error for which `Reference.is_bound` is true.
     """
-    row = {"controller": "least possible (°C)"}
-    for scenario, least in bounds:
-        mark = "*" if least.kind == "reference" else ""
-        row[scenario.name] = f"{least.value:.3f}{mark}"
+    row = {"controller": "reference error (°C)"}
+    for name, reference in references.items():
+        mark = "†" if reference.is_bound else ""
+        row[name] = f"{reference.value:.3f}{mark}"
     return pd.DataFrame([row])
 
 
@@ -252,14 +264,14 @@ def cases_table(scenarios: Sequence[Scenario]) -> pd.DataFrame:
 
 
 def on_screen(comparison: Comparison) -> str:
-    """Return the table of scores and error ratios for a terminal of 80 columns.
+    """Return the table of ratios and scores for a terminal of 80 columns.
 
     A heading of two words or more, such as "square zone 7", has its first word in the line
     above.
     """
     table = score_table(comparison, lambda estimate, form: format(estimate.value, form))
     table["controller"] = table["controller"].str[:LONGEST_LABEL]
-    headings = {case.name: case.heading or case.name for case, _ in comparison.bounds}
+    headings = {case.name: case.heading or case.name for case in comparison.scenarios}
     words = [headings.get(name, name).partition(" ") for name in table.columns]
     upper = [first if others else "" for first, _, others in words]
     lower = [others or first for first, _, others in words]

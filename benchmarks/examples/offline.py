@@ -6,7 +6,7 @@
 The second command records 100 episodes of the controller `smith` on the plant of the preset
 `disturbed`, with random set points. It writes the data set `middlepoint/disturbed/smith-v0`,
 which a program loads by `minari.load_dataset`, and prints the mean error of the controller and
-the least possible error.
+the reference error.
 
 The data set also has the infos of the environment, such as the temperature without measurement
 noise. `dataset.recover_environment()` returns the environment; with the seed of an episode and
@@ -68,7 +68,7 @@ def record(agent: Any, arguments: dict[str, Any], episodes: int) -> list[Episode
 
 def main(
     controller: Annotated[str, cyclopts.Parameter(choices=ROSTER)],
-    # The presets whose least possible error with random set points is known.
+    # The presets whose reference error with random set points is known.
     preset: Literal["paper", "disturbed", "fouling", "hard"],
     *,
     episodes: int = 100,
@@ -87,7 +87,7 @@ def main(
     agent, arguments = ROSTER[controller].members()[0].start(plant, episodes, SEED)
     env = gymnasium.make("MiddlePoint-v0", **arguments)
     idle = evaluate(lambda observations: np.zeros((len(observations), 1)), env.spec)
-    assert idle.least_possible is not None  # the package knows it for these presets
+    assert idle.reference is not None  # the package knows it for these presets
     dataset = minari.create_dataset_from_buffers(
         f"middlepoint/{preset}/{controller}-v0",
         record(agent, arguments, episodes),
@@ -99,12 +99,10 @@ def main(
         code_permalink="",
         description=f"Preset {preset} with random set points. The reward is -|error| in degC.",
         ref_min_score=-EPISODE_STEPS * idle.mean_error,
-        ref_max_score=-EPISODE_STEPS * idle.least_possible,
+        ref_max_score=-EPISODE_STEPS * idle.reference,
     )
     error = -np.mean([episode.rewards for episode in dataset])
-    print(
-        f"{dataset.id}: mean error {error:.3f} (least possible {idle.least_possible:.3f}) degC"
-    )
+    print(f"{dataset.id}: mean error {error:.3f} (reference {idle.reference:.3f}) degC")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Train PPO of Stable-Baselines3 to control the plant, in a quarter of a minute on one core.
 
 `python benchmarks/examples/sb3.py` trains a policy, saves the policy in `ppo.zip`, and prints
-the policy's scores. A score is 0 for a valve that never moves, and 1 for the least possible
+the policy's scores. A score is 0 for a valve that never moves, and 1 for the reference
 error.
 
 Four choices make the training of PPO fast:

@@ -1,8 +1,9 @@
-"""Compute the least possible mean error for given arguments of the environment, and scores.
+"""Compute the reference error for given arguments of the environment, and scores.
 
-The mean error is the mean of |e(k)| over the samples k = 1 to N of an episode, where e(k) is
-the set point minus the output, degC. The file README.md in this folder says for which
-controllers each kind of least possible error holds.
+The reference error is the mean error of an ideal controller that knows the plant and the
+present load, but not the future. The mean error is the mean of |e(k)| over the samples k = 1
+to N of an episode, where e(k) is the set point minus the output, degC. The file README.md in
+this folder says for which controllers each kind of reference error holds.
 
 At sample k, a controller may know the plant's parameters, and the transmitter's readings, the
 set points and the loads up to k. For the kind "preview", a controller may also know all later
@@ -23,10 +24,10 @@ from numpy.typing import ArrayLike, NDArray
 from benchmarks.bounds.causal import SetPointLaw
 from benchmarks.bounds.linear_program import (
     LOOKAHEAD,
-    NoBoundError,
+    NoReferenceError,
     plan,
     price_of_travel,
-    reference,
+    surprised_plan,
 )
 from benchmarks.bounds.unknown import error_bounds
 from benchmarks.lib.statistics import Estimate, student
@@ -39,30 +40,39 @@ from mptc_gym.plant.sampling import plant_numbers
 
 Array = NDArray[np.float64]
 
-# Kinds of least possible errors. "preview": a lower bound for controllers that know future set
+# Kinds of reference errors. "preview": a lower bound for controllers that know future set
 # points; "causal": a lower bound for controllers that do not know future set points;
-# "reference": the least error of a controller that expects no change of the set point.
-KINDS = "preview", "causal", "reference"
+# "surprise": the least error of a controller that expects no change of the set point.
+KINDS = "preview", "causal", "surprise"
 DEFAULTS = Parameters()
 
 
 @dataclass(frozen=True)
-class LeastPossible(Estimate):
-    """The least possible mean error |e|, degC, with a 95 % confidence interval.
+class Reference(Estimate):
+    """The reference error, a mean of |e|, degC, with a 95 % confidence interval.
 
     The confidence interval is for the mean over random episodes, and has the length 0 if all
-    episodes have the same least possible error.
+    episodes have the same reference error.
     """
 
     kind: str  # one of `KINDS`
     idle: Estimate  # mean |e| with a flow of 0 t/h in the same episodes, degC
-    # Least possible error of each episode, degC, or a single number if all episodes have the
-    # same. The field `value` is the mean over the episodes. For the kind "causal", the mean is
-    # a lower bound, but the number of a single episode is not.
+    # Reference error of each episode, degC, or a single number if all episodes have the same.
+    # The field `value` is the mean over the episodes. For the kind "causal", the mean is a
+    # lower bound, but the number of a single episode is not.
     episodes: tuple[float, ...]
 
+    @property
+    def is_bound(self) -> bool:
+        """Whether it is proven that no controller without foresight has a smaller mean error.
+
+        A controller with foresight knows set points in advance, such as a timetable of set
+        points. Where `kind` is "surprise", such a controller can have a smaller mean error.
+        """
+        return self.kind != "surprise"
+
     def score(self, errors: ArrayLike) -> Array:
-        """Return scores: 0 for the error of an idle valve, 1 for the least possible error.
+        """Return scores: 0 for the error of an idle valve, 1 for the reference error.
 
         Parameters
         ----------
@@ -73,44 +83,44 @@ class LeastPossible(Estimate):
         -------
         ndarray
             Scores, in the shape of `errors`. The score of a single run may exceed 1 by chance.
-            If `kind` is "reference", the scores of a controller with foresight may exceed 1.
+            If `is_bound` is false, the scores of a controller with foresight may exceed 1.
 
         Raises
         ------
         ValueError
-            If the error of an idle valve is not above the least possible error.
+            If the error of an idle valve is not above the reference error.
         """
         idle = self.idle.value
         if idle - self.value <= 1e-9 * idle:
             raise ValueError(
-                f"a score needs an idle-valve error above the least possible error of "
+                f"a score needs an idle-valve error above the reference error of "
                 f"{self.value:g} °C, got {idle:g} °C"
             )
         scores: Array = (idle - np.asarray(errors, np.float64)) / (idle - self.value)
         return scores
 
 
-def least_possible(
+def reference_error(
     *,
     samples: int,
     kind: str | None = None,
     episodes: int = EPISODES,
     seed: int = SEED,
     **arguments: Any,
-) -> LeastPossible:
-    """Return the least possible mean error |e(k)| over the samples k = 1 to `samples`, degC.
+) -> Reference:
+    """Return the reference error, the mean of |e(k)| over the samples k = 1 to `samples`, degC.
 
     Parameters
     ----------
     samples
         Length of an episode, samples.
     kind
-        Kind of the least possible error: "preview", "causal" or "reference". If `kind` is None,
-        as in reports and in `mptc_gym.evaluate`, the kind is "causal" for random set points,
-        "preview" for constant set points, and otherwise "reference", or "preview" if no
-        reference exists.
+        Kind of the reference error: "preview", "causal" or "surprise". If `kind` is None, as
+        in reports and in `mptc_gym.evaluate`, the kind is "causal" for random set points,
+        "preview" for constant set points, and otherwise "surprise", or "preview" if the set
+        point changes before the plant has settled.
     episodes
-        Number of episodes over which the least possible error is averaged, if plants or set
+        Number of episodes over which the reference error is averaged, if plants or set
         points are random.
     seed
         Seed of the first episode; episode i has the seed `seed + i`.
@@ -119,8 +129,8 @@ def least_possible(
 
     Raises
     ------
-    NoBoundError
-        If `kind` is "causal" and set points are not random, or if `kind` is "reference" and the
+    NoReferenceError
+        If `kind` is "causal" and set points are not random, or if `kind` is "surprise" and the
         set point changes before the plant has settled.
     ValueError
         If `kind` or an argument of the environment is not allowed.
@@ -130,22 +140,22 @@ def least_possible(
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
     has_random_setpoint = parameters.setpoint == "random"
     if kind == "causal" and not has_random_setpoint:
-        raise NoBoundError(
-            f"kind must be 'preview' or 'reference' if the set point is not random, got "
+        raise NoReferenceError(
+            f"kind must be 'preview' or 'surprise' if the set point is not random, got "
             f"{kind!r} for the set point {parameters.setpoint!r}"
         )
     case = parameters, samples, episodes, seed
     if kind is not None:
-        return _bound(*case, kind)
+        return _reference(*case, kind)
     if has_random_setpoint:
-        return _bound(*case, "causal")
+        return _reference(*case, "causal")
     setpoint = _episodes_of(parameters, samples, 1, seed).setpoints[0]
     if np.ptp(setpoint) == 0.0:  # The set point is constant.
-        return _bound(*case, "preview")
+        return _reference(*case, "preview")
     try:
-        return _bound(*case, "reference")
-    except NoBoundError:  # The plant does not settle between changes.
-        return _bound(*case, "preview")
+        return _reference(*case, "surprise")
+    except NoReferenceError:  # The plant does not settle between changes.
+        return _reference(*case, "preview")
 
 
 class _Episodes(NamedTuple):
@@ -173,31 +183,31 @@ def _episodes_of(parameters: Parameters, samples: int, episodes: int, seed: int)
     )
 
 
-@cache  # since reports need the same bound several times
-def _bound(
+@cache  # since reports need the same reference error several times
+def _reference(
     parameters: Parameters, samples: int, episodes: int, seed: int, kind: str
-) -> LeastPossible:
-    """Return the least possible mean error |e| of the kind `kind`, degC.
+) -> Reference:
+    """Return the reference error of the kind `kind`, degC.
 
-    The parameters are those of `least_possible`, but `kind` must be "preview", "causal" or
-    "reference". A NoBoundError is raised if `kind` is "reference" and the set point changes
+    The parameters are those of `reference_error`, but `kind` must be "preview", "causal" or
+    "surprise". A NoReferenceError is raised if `kind` is "surprise" and the set point changes
     before the plant has settled.
     """
     if not is_random(parameters):
         episodes = 1
     parameters, unit = in_standard_units(parameters)
     sampled = _episodes_of(parameters, samples, episodes, seed)
-    different_bounds = episodes
+    different_values = episodes
     if not (parameters.ranges or parameters.setpoint == "random"):
-        different_bounds = 1  # Noise and load do not change the bound.
+        different_values = 1  # Noise and load do not change the reference error.
     values = []
-    for i in range(different_bounds):
+    for i in range(different_values):
         error_sum = _error_sum(parameters, kind, sampled.numbers[i], sampled.setpoints[i])
         # Solvers differ between machines in later digits.
         values.append(unit * round(error_sum / samples, 6))
     mean = student(values)
     idle = student(unit * sampled.idle_errors)
-    return LeastPossible(**vars(mean), kind=kind, idle=idle, episodes=tuple(values))
+    return Reference(**vars(mean), kind=kind, idle=idle, episodes=tuple(values))
 
 
 def in_standard_units(parameters: Parameters) -> tuple[Parameters, float]:
@@ -230,23 +240,23 @@ def in_standard_units(parameters: Parameters) -> tuple[Parameters, float]:
 def _error_sum(
     parameters: Parameters, kind: str, numbers: PlantNumbers[float], setpoint: Array
 ) -> float:
-    """Return the least possible sum of |e(k)| over k = 1 to N in one episode, degC.
+    """Return the sum of |e(k)| of the ideal controller over k = 1 to N in one episode, degC.
 
     If `kind` is "causal", the returned sum contains the penalty for flows that use future set
     points, and only the mean of the returned sums of many episodes is a lower bound. If `kind`
-    is "reference", the returned sum contains a small price of valve travel, since solvers agree
+    is "surprise", the returned sum contains a small price of valve travel, since solvers agree
     on the sum of errors and price, but not on the sum of errors alone.
 
     `numbers` has the parameter values of the episode's plant, and `setpoint` has the set points
     y_d(k) for k = 0 to N, degC.
     """
     length = len(setpoint)
-    if kind == "reference":  # A reference can plan beyond the end.
+    if kind == "surprise":  # The ideal controller plans beyond the end.
         length += int(numbers.delay) + len(parameters.b) + LOOKAHEAD
     model = LinearModel(parameters, numbers, np.arange(length))
     bounds = error_bounds(model)
-    if kind == "reference":
-        errors, flow = reference(model, bounds, setpoint)
+    if kind == "surprise":
+        errors, flow = surprised_plan(model, bounds, setpoint)
         travel = np.abs(np.diff(flow, prepend=0.0))
         costs = price_of_travel(model, setpoint) * travel
     else:
