@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +14,6 @@ from mptc_gym.plant.actuator import float32_action
 from mptc_gym.plant.checks import nonzero, not_negative, number, positive, reject
 from mptc_gym.plant.parameters import Parameters
 
-# Arguments of the environment for an observation of the latest three set points and the latest
-# three errors: the six inputs of the paper's network.
-PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}
 Values = NDArray[np.float64] | np.float64  # one value per loop: shape () or (batch,)
 
 

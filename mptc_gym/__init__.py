@@ -12,9 +12,9 @@ registered environments. `evaluate` scores a policy.
 
 import gymnasium
 
-from mptc_gym.env import EPISODE_STEPS, MiddlePointEnv
+from mptc_gym.env import MiddlePointEnv
 from mptc_gym.evaluation import Evaluation, evaluate
-from mptc_gym.plant.parameters import Parameters
+from mptc_gym.plant.parameters import EPISODE_STEPS, Parameters
 from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 

@@ -23,7 +23,6 @@ from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import ONLY_PLANT, Signals
 from mptc_gym.record import Record
 
-EPISODE_STEPS = 1200  # samples after which the registered environments truncate an episode
 # The arguments that the `EnvSpec` of a batch has in addition to those of its plants.
 _BATCH_ARGUMENTS = "num_envs", "vectorization_mode", "max_episode_steps", "autoreset_mode"
 INFO = ("output", "setpoint", "error", "command", "applied", "noise")  # keys of every info

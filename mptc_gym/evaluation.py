@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mptc_gym.plant.actuator import action_from_command
 from mptc_gym.plant.checks import count
-from mptc_gym.plant.parameters import ARGUMENTS, INTERFACE, Parameters
+from mptc_gym.plant.parameters import ARGUMENTS, EPISODE_STEPS, INTERFACE, Parameters
 from mptc_gym.presets import IDS, PRESETS
 from mptc_gym.rollout import (
     Plants,
@@ -37,7 +37,6 @@ EPISODES: Final = 100  # episodes of a score, unless the caller asks for another
 # policy that is chosen on validation episodes is not chosen on the default episodes of a score.
 VALIDATION_SEED: Final = 5_000_000
 VALIDATION_EPISODES: Final = 200  # validation episodes with a known reference error
-SAMPLES: Final = 1200  # samples of an episode, unless the environment ends the episode earlier
 # Arguments of an environment that change observations or rewards, but not the error of an ideal
 # controller.
 _WITHOUT_EFFECT_ON_REFERENCE: Final = *INTERFACE, "reward", "error_scale", "move_weight"
@@ -268,7 +267,7 @@ def _run(
     rounds: list[_Runs] = []
     for first in seeds[::n]:
         seeds_of_round = range(first, first + n)
-        samples = rollout(plants, start(policy, n), SAMPLES, seeds_of_round)
+        samples = rollout(plants, start(policy, n), EPISODE_STEPS, seeds_of_round)
         if is_replayed:
             samples = replayed(samples, case, seeds_of_round)
         rounds.append(_measure(samples, n))
@@ -313,11 +312,11 @@ def find_reference(parameters: Parameters, length: int, seeds: range) -> StoredR
             "of the plant; in a checkout, python -m benchmarks.bounds --help says how to "
             "compute others",
         )
-    if length != SAMPLES:
+    if length != EPISODE_STEPS:
         return StoredReference(
             None,
-            why_not=f"reference errors are kept for episodes of {SAMPLES:,} samples, not of "
-            f"{length:,}: leave max_episode_steps as it is",
+            why_not=f"reference errors are kept for episodes of {EPISODE_STEPS:,} samples, not "
+            f"of {length:,}: leave max_episode_steps as it is",
         )
     for first, errors in case.errors_by_seed.items():
         if len(errors) == 1:  # for all seeds, as only noise and load are random
@@ -375,7 +374,7 @@ def _idle_errors(parameters: Parameters, seeds: range) -> Values:
     plants = MiddlePointVectorEnv(n, **asdict(parameters))
     idle_action = action_from_command(0.0, parameters.u_min, parameters.u_max)
     idle_actions = np.full((n, 1), idle_action)
-    samples = rollout(plants, lambda _: idle_actions, SAMPLES, [*seeds])
+    samples = rollout(plants, lambda _: idle_actions, EPISODE_STEPS, [*seeds])
     return _measure(samples, n).errors
 
 

@@ -44,7 +44,13 @@ from mptc_gym.plant.actuator import (
 )
 from mptc_gym.plant.checks import NOT_A_NUMBER, one_of, reject
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL, FACTORS, Dynamics
-from mptc_gym.plant.parameters import ARGUMENTS, Parameters, PlantNumbers, full_signature
+from mptc_gym.plant.parameters import (
+    ARGUMENTS,
+    EPISODE_STEPS,
+    Parameters,
+    PlantNumbers,
+    full_signature,
+)
 from mptc_gym.plant.signals import LOAD_INTERVAL, SetPointLevels, noise_polynomials
 
 Number = float | Tensor  # a float for all plants, or an element for each plant, shape (n,)
@@ -514,7 +520,7 @@ class MiddlePointTorchEnv(BatchEnv):
         *,
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
-        max_episode_steps: int | None = 1200,
+        max_episode_steps: int | None = EPISODE_STEPS,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         differentiable: bool = False,
         **arguments: Any,

@@ -13,11 +13,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from mptc_gym.batch import BatchEnv, Infos, Mask
-from mptc_gym.env import EPISODE_STEPS, INFO, NO_RENDER_MODE, Frame, MiddlePointEnv
+from mptc_gym.env import INFO, NO_RENDER_MODE, Frame, MiddlePointEnv
 from mptc_gym.plant.actuator import WantedFlows, action_from_command
 from mptc_gym.plant.checks import is_count, many_actions, one_of, reject, to_python
 from mptc_gym.plant.dynamics import PlantBatch
-from mptc_gym.plant.parameters import Parameters, full_signature
+from mptc_gym.plant.parameters import EPISODE_STEPS, Parameters, full_signature
 from mptc_gym.plant.sampling import PlantSampler, RandomStreams, plant_numbers
 from mptc_gym.plant.signals import Indices, Signals, Values
 from mptc_gym.record import Record

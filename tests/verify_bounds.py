@@ -16,9 +16,9 @@ from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import SEED
 from mptc_gym.plant.actuator import action_from_command
+from mptc_gym.plant.parameters import EPISODE_STEPS
 
 RUNS = 300
-SAMPLES = 1200  # of a run
 ODD = {"delay": 30, "u_min": -12.0, "u_max": 6.0, "dead_zone": 4.0, "setpoint_amplitude": 3.0}
 RANDOM = {"setpoint": "random"}
 NOISE = {"noise_variance": 0.5}
@@ -95,10 +95,12 @@ def main(runs=RUNS):
     beaten = []
     for case, arguments in CASES.items():
         kind = "causal" if arguments.get("setpoint") == "random" else "preview"
-        reference = reference_error(samples=SAMPLES, kind=kind, episodes=runs, **arguments)
+        reference = reference_error(
+            samples=EPISODE_STEPS, kind=kind, episodes=runs, **arguments
+        )
         row = {"case": case, "bound": f"{reference.value:.3f}", "kind": reference.kind}
         for name, controller in CONTROLLERS.items():
-            run_errors = errors(controller, runs, SAMPLES, **arguments)
+            run_errors = errors(controller, runs, EPISODE_STEPS, **arguments)
             row[name] = f"{run_errors.mean():.3f}"
             if beats(run_errors, reference):
                 beaten.append(f"{name}: {case}")

@@ -17,11 +17,11 @@ from benchmarks.loop.scenarios import PRESET_SCENARIOS, SCENARIOS, PlantOptions,
 from mptc_gym import PRESETS
 from mptc_gym.evaluation import (
     EPISODES,
-    SAMPLES,
     SEED,
     VALIDATION_EPISODES,
     VALIDATION_SEED,
 )
+from mptc_gym.plant.parameters import EPISODE_STEPS
 
 # Heading of the table's column for each kind of reference error.
 HEADINGS = {"preview": "with preview", "causal": "without preview", "surprise": "surprise"}
@@ -139,7 +139,7 @@ def write_package(fan_out: FanOut) -> None:
         "commit": commit(),
         "versions": versions(),
         "unit": "degC, mean of |e(k)| over k = 1 to samples",
-        "samples": SAMPLES,
+        "samples": EPISODE_STEPS,
         "seed": SEED,
         "episodes": PACKAGED_EPISODES,
         "validation_seed": VALIDATION_SEED,
@@ -159,7 +159,7 @@ def packaged_case(arguments: dict[str, Any]) -> dict[str, Any]:
     episodes, the returned dict also has the list "validation_reference": the reference error,
     degC, of each episode with which trained policies are selected.
     """
-    reference = partial(reference_error, samples=SAMPLES, **arguments)
+    reference = partial(reference_error, samples=EPISODE_STEPS, **arguments)
     published = reference(seed=SEED, episodes=PACKAGED_EPISODES)
     entry = {"arguments": arguments, "kind": published.kind, "reference": published.episodes}
     if len(published.episodes) > 1:

@@ -21,6 +21,7 @@ from benchmarks.loop.measures import mean_error, settled
 from benchmarks.loop.scenarios import SETPOINTS as PAPER_SETPOINTS
 from benchmarks.loop.scenarios import Arguments, Scenario
 from mptc_gym import PRESETS, Parameters
+from mptc_gym.plant.parameters import EPISODE_STEPS
 from mptc_gym.rollout import Act
 
 # Limits that give words of the claims, such as "notable", a meaning. The limits were chosen
@@ -30,7 +31,7 @@ LARGE_CHANGE = 0.2  # "much better", "seriously worse": the error differs by at 
 PAPER_CONVERGENCE = 150  # samples in which the weights converge, according to the paper
 
 SETPOINT_LEVEL = 5.0  # degC, the constant set point, and the amplitude of the square wave
-RUN_LENGTH = 1200  # length of a run, samples, unless the case has another length
+RUN_LENGTH = EPISODE_STEPS  # length of a run, samples, unless the case has another length
 LEARNING_LENGTH = 600  # samples after which a network counts as trained
 WITH_NOISE = PRESETS["noisy"]
 NOISY_SQUARE = Scenario("noisy-square", "square wave, R = 0.5 °C²", RUN_LENGTH, WITH_NOISE)

@@ -17,13 +17,12 @@ from agents import (
     SelfTuningController,
     SmithPredictor,
 )
-from agents.controller import PAPER_WINDOWS
 from agents.networks import PRETRAINED
 from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.runs import Agent, IdleValve, Trajectory, make_plants, simulate
-from mptc_gym.plant.parameters import INTERFACE
+from mptc_gym.plant.parameters import INTERFACE, PAPER_WINDOWS
 
 # Ratio of the closed-loop time constant of Dahlin's controller to the plant's time constant.
 # The small ratio makes the control loop fast; the filter time constant makes the control loop

@@ -28,7 +28,7 @@ from minari.data_collector import EpisodeBuffer
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.lib.seeds import SEEDS
 from mptc_gym import PRESETS, evaluate
-from mptc_gym.env import EPISODE_STEPS
+from mptc_gym.plant.parameters import EPISODE_STEPS
 from mptc_gym.rollout import rollout
 
 SEED = SEEDS["data sets"].start  # seed of the first episode; episode i has the seed SEED + i

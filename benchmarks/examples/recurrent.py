@@ -20,10 +20,10 @@ from torch import Tensor, nn
 
 from mptc_gym import IDS, PRESETS, evaluate
 from mptc_gym.evaluation import VALIDATION_SEED
+from mptc_gym.plant.parameters import EPISODE_STEPS
 from mptc_gym.torch_env import MiddlePointTorchEnv
 
 FILE = Path("recurrent.pt")  # the file of the trained network
-SAMPLES = 1200  # number of samples in an episode
 # Number of samples in a segment, over which gradients are computed. The delay is at most 24
 # samples, so a segment contains most of the effect of most flows on the output.
 SEGMENT = 150
@@ -102,7 +102,7 @@ def train(steps: int = 400, plants: int = 128, seed: int = 0) -> Recurrent:
         plants, differentiable=True, setpoint_window=1, error_window=1, **PRESETS["hard"]
     )
     for step in range(steps):
-        if step % (SAMPLES // SEGMENT) == 0:
+        if step % (EPISODE_STEPS // SEGMENT) == 0:
             observations, _ = env.reset(seed=step)
             network.begin(plants)
         # Gradients do not flow back beyond the first sample of this segment.

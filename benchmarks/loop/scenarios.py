@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from benchmarks.lib.command import CommandError, Parameter, options
 from mptc_gym import PRESETS, Parameters
-from mptc_gym.plant.parameters import INTERFACE
+from mptc_gym.plant.parameters import EPISODE_STEPS, INTERFACE
 
 Arguments = dict[str, Any]  # keyword arguments of the environment `MiddlePoint-v0`
 
@@ -49,7 +49,7 @@ class Scenario:
 
 
 SETPOINTS = (
-    Scenario("square", "square wave", 1200, {}),
+    Scenario("square", "square wave", EPISODE_STEPS, {}),
     Scenario("constant", "constant set point", 600, {"setpoint": 5.0}),
 )
 """The set points of the paper's cases, with the environment's default plant.
@@ -64,20 +64,20 @@ SCENARIOS = {
     "square": Scenario(
         "square",
         "square wave, dead zone 5 t/h, no noise (Figs 5 and 10)",
-        1200,
+        EPISODE_STEPS,
         PRESETS["paper"],
     ),
     "square-dead-zone-7": Scenario(
         "square-dead-zone-7",
         "square wave, dead zone 7 t/h, no noise (Figs 6 and 7)",
-        1200,
+        EPISODE_STEPS,
         PRESETS["dead-zone-7"],
         "square zone 7",
     ),
     "square-noise": Scenario(
         "square-noise",
         "square wave, dead zone 5 t/h, R = 0.5 °C² (Figs 8, 9 and 11)",
-        1200,
+        EPISODE_STEPS,
         PRESETS["noisy"],
         "square noise",
     ),
@@ -107,14 +107,16 @@ SCENARIOS = {
     "load": Scenario(
         "load",
         "load steps within ±1.5 °C at a held set point, dead zone 5 t/h, no noise",
-        1200,
+        EPISODE_STEPS,
         {**_CONSTANT, "disturbance_amplitude": 1.5, "disturbance_interval": 200.0},
     ),
 }
 """The cases of the paper, and a case with steps of the load, by name."""
 _HEADINGS = {"dead-zone-7": "dead zone 7", "disturbed": "disturb.", "randomised": "random."}
 PRESET_SCENARIOS = {
-    name: Scenario(name, f"preset {name}", 1200, dict(arguments), _HEADINGS.get(name, ""))
+    name: Scenario(
+        name, f"preset {name}", EPISODE_STEPS, dict(arguments), _HEADINGS.get(name, "")
+    )
     for name, arguments in PRESETS.items()
 }
 
@@ -162,7 +164,9 @@ class PlantOptions:
             return default
         cases: tuple[Scenario, ...] = SETPOINTS
         if "setpoint" in arguments:
-            cases = (Scenario("run", "the set point of the plant's arguments", 1200, {}),)
+            cases = (
+                Scenario("run", "the set point of the plant's arguments", EPISODE_STEPS, {}),
+            )
         cases_by_name = {}
         for case in cases:
             title = f"{case.title}, {self.name}"

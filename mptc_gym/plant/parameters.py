@@ -18,6 +18,9 @@ from mptc_gym.plant.checks import Number, reject
 WINDOWS: Final = "setpoint_window", "error_window", "output_window", "action_window"
 # The arguments of an environment that say what a policy observes and what its actions mean.
 INTERFACE: Final = *WINDOWS, "action", "max_move", "compensated_dead_zone"
+# The observation of the paper's network: y_d(k), y_d(k-1), y_d(k-2), e(k), e(k-1) and e(k-2).
+PAPER_WINDOWS: Final = {"setpoint_window": 3, "error_window": 3}
+EPISODE_STEPS: Final = 1200  # samples of an episode, unless an environment is made with others
 Value = TypeVar("Value")  # type of a `PlantNumbers` field: float, array, tensor or `Number`
 
 
@@ -152,7 +155,10 @@ class Parameters(PlantNumbers[Number]):
         "coefficients of C in equation (28), from z^0 on; the first is 1",
     )
     drift_samples: int = _argument(
-        1200, checks.count_from_1, "samples", "time in which gain and time constant drift"
+        EPISODE_STEPS,
+        checks.count_from_1,
+        "samples",
+        "time in which gain and time constant drift",
     )
     sampling_interval: float = _argument(
         8.0,
@@ -182,13 +188,17 @@ class Parameters(PlantNumbers[Number]):
         'P: "square" repeats every P samples; "random" holds each level for a uniform random '
         "number of samples from P/6 to P/2",
     )
-    # The default observation is the six inputs of the paper's network: the set points y_d(k),
-    # y_d(k-1), y_d(k-2) and the errors e(k), e(k-1), e(k-2).
     setpoint_window: int = _argument(
-        3, checks.count_from_0, "samples", "number of latest set points in the observation"
+        PAPER_WINDOWS["setpoint_window"],
+        checks.count_from_0,
+        "samples",
+        "number of latest set points in the observation",
     )
     error_window: int = _argument(
-        3, checks.count_from_0, "samples", "number of latest errors in the observation"
+        PAPER_WINDOWS["error_window"],
+        checks.count_from_0,
+        "samples",
+        "number of latest errors in the observation",
     )
     output_window: int = _argument(
         0,
