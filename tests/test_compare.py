@@ -87,6 +87,14 @@ def some_runs(**errors):
     )
 
 
+def test_the_idle_valve_of_a_score_runs_in_the_episodes_of_the_controllers():
+    runs = 120
+    scenario = replace(SCENARIOS["constant-noise"], samples=60)
+    idle = run_case(scenario, ROSTER["idle"], runs, SEED).runs[0]["mae"]
+    reference = reference_of(scenario, runs, SEED)
+    assert reference.score(idle.mean()) == pytest.approx(0.0)
+
+
 class TestEstimates:
     def test_by_hand(self):
         reference = reference_of(SCENARIOS["constant"], 3, SEED)

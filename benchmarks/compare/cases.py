@@ -21,7 +21,6 @@ from benchmarks.loop.linear import LinearController, LinearLoop, nominal
 from benchmarks.loop.measures import measure
 from benchmarks.loop.runs import Trajectory, is_random, simulate_together
 from benchmarks.loop.scenarios import Scenario
-from mptc_gym.evaluation import EPISODES
 
 Columns = dict[str, Any]  # the columns of a table by name: arrays, or one value for all rows
 
@@ -142,19 +141,17 @@ def responses_over_time(
 
 
 def reference_of(scenario: Scenario, runs: int, seed: int) -> Reference:
-    """Return the reference error in a scenario, a mean over episodes.
+    """Return the reference error in a scenario, a mean over the episodes of the runs.
 
-    As reference errors take long to compute, the mean is over the first `runs` episodes, but at
-    most over `EPISODES` episodes. Episode i has the seed `seed + i`.
+    Episode i of the `runs` episodes has the seed `seed + i`, as in `run_case`.
 
     Raises
     ------
     ValueError
         If the error of an idle valve in `scenario` is not above the reference error.
     """
-    episodes = min(runs, EPISODES)
     reference = reference_error(
-        samples=scenario.samples, episodes=episodes, seed=seed, **scenario.arguments
+        samples=scenario.samples, episodes=runs, seed=seed, **scenario.arguments
     )
     # Without scores, a case cannot be reported. So the method is called here, where a
     # ValueError ends only the task of this case.
