@@ -25,8 +25,8 @@ SCORE_TEXT = (
     "the mean error divided by the reference error. The score says which share of the way from "
     "the error of an idle valve, which keeps the flow at 0 t/h, to the reference error a "
     "controller covers, as a mean over all cases. In parentheses are 95 % confidence "
-    "intervals. The valve travel is the sum of all changes of the applied flow in a run, as a "
-    "mean over all runs."
+    "intervals. The valve travel is the sum of the magnitudes of all changes of the applied "
+    "flow in a run, as a mean over all runs."
 )
 REFERENCE_TEXT = (
     "The first row has the reference errors. The mark † means: it is proven that no controller "
@@ -39,8 +39,8 @@ COSTS_TEXT = (
     "and the column 'searched or trained' says how its settings or weights were found; 1 M "
     "samples are a million samples. Ms is the maximum sensitivity of a control loop, the "
     "largest magnitude of its sensitivity function: the lower Ms is, the more robust is the "
-    "loop. Ms is given for linear controllers, with the nominal plant of the first case, "
-    "without dead zone and limits."
+    "loop. Ms is given for linear controllers, with the nominal plant of the first case that "
+    "has finished, without dead zone and limits."
 )
 CASES_TEXT = (
     "Each case is the environment MiddlePoint-v0 with the arguments in the last column; all "
