@@ -19,7 +19,6 @@ from benchmarks.compare import plots
 from benchmarks.compare.__main__ import main
 from benchmarks.compare.cases import reference_of, run_case
 from benchmarks.compare.estimates import estimate, ranked
-from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop.measures import mean_error, measure
 from benchmarks.loop.runs import make_plants, simulate
@@ -132,12 +131,6 @@ def test_each_training_is_measured_as_if_it_ran_alone():
     for member, columns in zip(members, result.runs, strict=True):
         alone = member.run(case.arguments, case.samples, 2, SEED)
         np.testing.assert_array_equal(columns["mae"], mean_error(alone))
-
-
-def test_each_controller_has_its_own_look():
-    own = own_controllers([f"{name}=agents:PIController" for name in "abcd"])
-    looks = [controller.look for controller in {**ROSTER, **own}.values()]
-    assert len(set(looks)) == len(looks)
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ class Counting:
         return action_from_command(level / self.gain, *self.limits)
 
 
-COUNTING = ControllerSpec(name="counting", label="counting", look=("", ""), make=Counting)
+COUNTING = ControllerSpec(name="counting", label="counting", group="own", make=Counting)
 CONTROLLERS = {name: spec.members()[0] for name, spec in ROSTER.items()}
 CONTROLLERS["counting"] = COUNTING
 

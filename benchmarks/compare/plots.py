@@ -14,23 +14,20 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import NullLocator
-from numpy.typing import ArrayLike, NDArray
 
-from benchmarks.controllers.roster import ControllerSpec
+from benchmarks.controllers.roster import GROUPS, ControllerSpec
 from benchmarks.lib.pictures import DEAD_ZONE, LIMIT, SETPOINT, open_picture
 from benchmarks.lib.statistics import Estimate
 from benchmarks.loop.scenarios import Scenario
 from mptc_gym import Parameters
 
-# Ticks of the axis of scores. The axis is logarithmic in 1 minus the score, so that a score of
-# 1 would lie at infinity. A score beyond an end of the axis is drawn at the end.
-SCORE_TICKS = 0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999
 SCORE_LABEL = (
     "score: 0 for an idle valve, 1 for the reference error\n"
-    "(axis logarithmic in 1 minus the score, to show small differences near 1)\n"
-    "large marker and number: mean over all cases; small tick: one case"
+    "marker and number: mean over all cases; tick: one case; open marker: learns in the run"
 )
+# A picture with more controllers than `MOST_PICTURED` would be too high.
+MOST_PICTURED = 8
+PAPER_CONTROLLERS = "nn", "pi"  # which case pictures compare
 
 # The look of the band from the 10th to the 90th percentile of the runs.
 BAND: Any = {"alpha": 0.3, "linewidth": 0}
@@ -44,8 +41,9 @@ def plot_scores(
 ) -> None:
     """Draw the scores of controllers: a row for each controller, on a common axis of scores.
 
-    Each row has a large marker at the overall score of the controller, and a small tick at the
-    controller's score in each scenario.
+    Controllers with equal prior knowledge stand together under a heading, those with the
+    highest score first. Each row has a marker at the overall score of the controller, and a
+    small tick at the controller's score in each scenario. Scores below 0 are drawn at 0.
 
     Parameters
     ----------
@@ -58,41 +56,40 @@ def plot_scores(
     path : Path
         The PNG file.
     """
-    best, *_ = scores
-    title = f"{controllers[best].label} has the highest score, {scores[best].value:.3f}"
+    agents_of: dict[str, list[str]] = {group: [] for group in GROUPS}
+    for agent in scores:
+        agents_of[controllers[agent].group].append(agent)
+    shown = {group: agents for group, agents in agents_of.items() if agents}
+    best = [f"{group} {scores[agents[0]].value:.3f}" for group, agents in shown.items()]
+    title = f"Best score by prior knowledge: {', '.join(best)}"
     cases = estimates["scenario"].nunique()
-    labels = []
-    height = 1.5 + 0.3 * len(scores)  # inches: title and axis, and the rows
-    with open_picture(path, height, title) as figure:
+    labels = {}
+    row = 0
+    with open_picture(path, 1.4 + 0.24 * (len(scores) + len(shown)), title) as figure:
         axes = figure.subplots()
-        for row, (agent, score) in enumerate(scores.items()):
-            colour, marker = controllers[agent].look
-            scores_of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
-            scenario_scores = [float(np.mean(values)) for values in scores_of_runs]
-            labels.append(controllers[agent].label)
-            if len(scenario_scores) < cases:
-                labels[row] += f"\n({len(scenario_scores)} of {cases} cases)"
-            rows = np.full(len(scenario_scores), row)
-            tick: Any = {"color": colour, "marker": "|", "ms": 9, "mew": 1.4, "ls": ""}
-            axes.plot(distance(scenario_scores), rows, **tick)
-            axes.plot(distance(score.value), row, color=colour, marker=marker, ms=6.5)
-            right_of_axes = (1.01, row)
-            text = f"{score.value:.3f}"
-            axes.annotate(text, right_of_axes, xycoords=("axes fraction", "data"), va="center")
-        axes.set_yticks(range(len(scores)), labels)
-        axes.set_ylim(len(scores) - 0.5, -0.5)  # The first controller has the top row.
-        axes.set_xscale("log")
-        lowest, *others, highest = [f"{tick:g}" for tick in SCORE_TICKS]
-        tick_labels = [f"≤ {lowest}", *others, f"≥ {highest}"]
-        axes.set_xticks(distance(SCORE_TICKS), tick_labels)
-        axes.set_xlim(1.15, 0.00087)
-        axes.xaxis.set_minor_locator(NullLocator())
+        for group, agents in shown.items():
+            look = GROUPS[group]
+            heading = (0.008, row)
+            place: Any = {"xycoords": ("axes fraction", "data"), "va": "center"}
+            axes.annotate(look.title, heading, color=look.colour, weight="bold", **place)
+            row += 1
+            for agent in agents:
+                scores_of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
+                of_cases = np.maximum([np.mean(values) for values in scores_of_runs], 0.0)
+                line: Any = {"color": look.colour, "marker": "|", "ms": 8, "lw": 1.3}
+                axes.plot(of_cases, np.full(len(of_cases), row), **line)
+                face = "white" if controllers[agent].learns else look.colour
+                mean: Any = {"color": look.colour, "marker": look.marker, "ms": 7}
+                axes.plot(max(scores[agent].value, 0.0), row, markerfacecolor=face, **mean)
+                axes.annotate(f"{scores[agent].value:.3f}", (1.01, row), **place)
+                labels[row] = controllers[agent].label
+                if len(of_cases) < cases:
+                    labels[row] += f" ({len(of_cases)} of {cases} cases)"
+                row += 1
+        axes.set_yticks(list(labels), list(labels.values()))
+        axes.set_ylim(row - 0.4, -0.6)  # The first group has the top rows.
+        axes.grid(visible=False, axis="y")
         axes.set_xlabel(SCORE_LABEL)
-
-
-def distance(scores: ArrayLike) -> NDArray[np.float64]:
-    """Return 1 minus each score, for a logarithmic axis from the first to the last tick."""
-    return 1.0 - np.clip(scores, SCORE_TICKS[0], SCORE_TICKS[-1])
 
 
 def plot_responses(
@@ -104,12 +101,13 @@ def plot_responses(
 ) -> None:
     """Draw the temperature and the flow over time, in a row of panels for each controller.
 
-    The controller with the smallest mean error has the top row.
+    The controllers of the paper have the top rows, and the others follow in the order of their
+    mean errors. The title compares those of the paper, or else the worst and the best.
 
     Parameters
     ----------
     responses : pandas.DataFrame
-        The rows of all controllers to draw, from the tables `runs.Result.responses`.
+        The rows of all controllers, from the tables `cases.Result.responses`.
     errors : pandas.Series
         Mean error of each controller in the scenario, degC, by the name of the controller.
     scenario : Scenario
@@ -118,14 +116,19 @@ def plot_responses(
     path : Path
         The PNG file.
     """
-    errors_drawn = errors[responses["agent"].unique()].sort_values(kind="stable")
-    agents = list(errors_drawn.index)
+    agents = pictured(errors, controllers)
+    errors = errors[agents]
     title = scenario.title
     if len(agents) > 1:
-        best = controllers[agents[0]].label
-        worst = controllers[agents[-1]].label
-        ratio = errors_drawn.iloc[-1] / errors_drawn.iloc[0]
-        title += f": {worst} has {ratio:.1f} times the mean error of {best}"
+        compared = [agent for agent in PAPER_CONTROLLERS if agent in agents]
+        if len(compared) < 2:
+            compared = agents
+        best = min(compared, key=errors.__getitem__)
+        worst = max(compared, key=errors.__getitem__)
+        title += (
+            f": {controllers[worst].label} has {errors[worst] / errors[best]:.1f} times "
+            f"the mean error of {controllers[best].label}"
+        )
     height = 1.4 + 1.25 * len(agents)  # inches: title and legend, and the rows
     with open_picture(path, height, title) as figure:
         # Matplotlib would need more time to place the panels than to draw them.
@@ -144,9 +147,10 @@ def plot_responses(
         )
         for (temperature_axes, flow_axes), agent in zip(grid, agents, strict=True):
             rows = responses[responses["agent"] == agent]
-            colour, _ = controllers[agent].look
+            colour = GROUPS[controllers[agent].group].colour
             label = controllers[agent].label
             temperature_axes.set_title(f"{label}: mean error {errors[agent]:.3f} °C")
+            flow_axes.set_title(controllers[agent].prior_knowledge)
             _draw_temperature(temperature_axes, rows, colour)
             _draw_flow(flow_axes, rows, colour, scenario.parameters)
         for axes in grid[-1]:
@@ -160,6 +164,22 @@ def plot_responses(
             ncols=4,
             columnspacing=1.5,
         )
+
+
+def pictured(errors: pd.Series[float], controllers: Mapping[str, ControllerSpec]) -> list[str]:
+    """Return the names of the controllers to draw in a case, in the order of their rows.
+
+    `errors` has the mean error of each controller. Of more than `MOST_PICTURED` controllers,
+    only those of the paper, the best one that knows a step test, PPO and users' own are drawn.
+    """
+    agents = [str(agent) for agent in errors.sort_values(kind="stable").index]
+    first = [agent for agent in PAPER_CONTROLLERS if agent in agents]
+    others = [agent for agent in agents if agent not in first]
+    if len(agents) > MOST_PICTURED:
+        tested = [agent for agent in others if controllers[agent].group == "step test"]
+        own = [agent for agent in others if controllers[agent].group == "own"]
+        others = [*tested[:1], *(agent for agent in others if agent == "ppo"), *own]
+    return first + others
 
 
 def _draw_temperature(axes: Axes, rows: pd.DataFrame, colour: str) -> None:
@@ -184,8 +204,11 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
     axes.axhspan(-dead_zone, dead_zone, **DEAD_ZONE)
     for limit in (plant.range_of("u_min")[0], plant.range_of("u_max")[0]):
         axes.axhline(limit, **LIMIT)
-    minutes = rows["time_s"] / 60.0
-    axes.step(minutes, rows["applied_run"], where="post", color=colour, linewidth=1.0)
+    minutes = rows["time_s"].to_numpy() / 60.0
+    flows = rows["applied_run"].to_numpy()
+    # Jumps, such as those across the dead zone, are thin, so that they do not hide the flow.
+    axes.step(minutes, flows, where="post", color=colour, linewidth=0.4)
+    axes.hlines(flows[:-1], minutes[:-1], minutes[1:], color=colour, linewidth=1.4)
     axes.set_ylabel("applied flow\n(t/h)")
 
 

@@ -1,7 +1,7 @@
 """Write the tables, pictures and report of a comparison of controllers in scenarios."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from benchmarks.bounds.reference import Reference
 from benchmarks.compare import plots
 from benchmarks.compare.cases import Result
 from benchmarks.compare.estimates import estimate, ranked, summarise, write_table
-from benchmarks.controllers.roster import ROSTER, ControllerSpec
+from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.command import CommandError
 from benchmarks.lib.sections import Section, write_report
 from benchmarks.lib.statistics import Estimate
@@ -48,15 +48,12 @@ CASES_TEXT = (
     "Shin (1992)."
 )
 PICTURES_TEXT = (
-    "To stay readable, the pictures show only these controllers: {}. The file CASE.csv of a "
-    "case has the temperature and the flow of all controllers."
+    "To stay readable, the pictures show the network and the PI controller of 1992, the best "
+    "controller of the case that knows a step test, PPO, and your own controllers. The file "
+    "CASE.csv of a case has the temperature and the flow of all controllers."
 )
 SCREEN_TEXT = "cases: error / reference error; score: 0 idle valve, 1 reference error"
 LONGEST_LABEL = 16  # largest number of characters of a controller's label on the screen
-# Of more controllers than `MOST_PICTURED`, the pictures of responses over time show only users'
-# own controllers and `PICTURED`: those of the paper, a model-based and a trained controller.
-MOST_PICTURED = 8
-PICTURED = "nn", "pi", "dahlin", "ppo"
 
 
 @dataclass(frozen=True)
@@ -138,7 +135,6 @@ def write(
     plots.plot_scores(scores, estimates, controllers, folder / "scores.png")
     for scenario in reported:
         rows = responses[scenario.name]
-        rows = rows[rows["agent"].isin(pictured(rows["agent"].unique()))]
         case_runs = reported_runs[reported_runs["scenario"] == scenario.name]
         errors = case_runs.groupby("agent")["mae"].mean()
         path = folder / f"{scenario.name}.png"
@@ -155,23 +151,13 @@ def write(
     return "\n".join(filter(None, [on_screen(comparison), note, path_text]))
 
 
-def pictured(agents: Iterable[str]) -> list[str]:
-    """Return the names of the controllers whose temperature and flow are drawn."""
-    names = list(agents)
-    if len(names) <= MOST_PICTURED:
-        return names
-    return [name for name in names if name in PICTURED or name not in ROSTER]
-
-
 def sections(comparison: Comparison, note: str) -> list[Section]:
     """Return the sections of a comparison's report, with `note` in the first section."""
     table = score_table(comparison, format)
     first_row = reference_table(comparison.references)
     cases_text = [CASES_TEXT]
-    drawn = pictured(comparison.scores)
-    if len(drawn) < len(comparison.scores):
-        labels = [comparison.controllers[name].label for name in drawn]
-        cases_text.append(PICTURES_TEXT.format(", ".join(labels)))
+    if len(comparison.scores) > plots.MOST_PICTURED:
+        cases_text.append(PICTURES_TEXT)
     return [
         Section(
             "Ratios and scores",

@@ -18,8 +18,6 @@ from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.command import CommandError
 
-# The colours and markers that a user's own controllers get in turn.
-LOOKS = ("#5B3FA6", "P"), ("#B22222", "X"), ("#3B7A2B", "8"), ("#17798C", "d")
 FORMS = (
     "NAME=MODULE:FACTORY, NAME=gains.json of benchmarks.tune, or NAME=FILE.npz of "
     "benchmarks.train, with a NAME that no other controller has"
@@ -48,19 +46,18 @@ def own_controllers(words: Sequence[str]) -> dict[str, ControllerSpec]:
             raise CommandError(f"--agent: {word!r} must have the form {FORMS}")
         locations_of.setdefault(name, []).append(location)
     controllers = {}
-    for i, (name, locations) in enumerate(locations_of.items()):
+    for name, locations in locations_of.items():
         try:
             controller = _controller(locations)
         except (KeyError, OSError, TypeError, ValueError) as error:
             word = f"{name}={' '.join(locations)}"
             raise CommandError(f"--agent: {word} must be {FORMS}: {error}") from error
-        look = LOOKS[i % len(LOOKS)]
-        controllers[name] = replace(controller, name=name, label=name, look=look)
+        controllers[name] = replace(controller, name=name, label=name, group="own")
     return controllers
 
 
 def _controller(locations: Sequence[str]) -> ControllerSpec:
-    """Return the record of a controller at `locations`, without its name, label and look."""
+    """Return the record of a controller at `locations`, without its name, label and group."""
     if locations[0].endswith(".json"):
         (file,) = locations
         return _with_searched_gains(Path(file))
@@ -72,7 +69,7 @@ def _controller(locations: Sequence[str]) -> ControllerSpec:
         if not factory or importlib.util.find_spec(package) is None:
             raise ValueError(f"{package!r} is no module in the current folder, or installed")
     return ControllerSpec(
-        name="", label="", look=("", ""), make=from_factory, trainings=locations, random=True
+        name="", label="", group="", make=from_factory, trainings=locations, random=True
     )
 
 

@@ -30,6 +30,28 @@ from mptc_gym.plant.parameters import INTERFACE, PAPER_WINDOWS
 LAMBDA = 0.1
 
 
+@dataclass(frozen=True)
+class Group:
+    """Controllers with equal prior knowledge, which pictures show alike."""
+
+    title: str
+    """What the controllers know before a run, in a few words."""
+    colour: str
+    marker: str
+    """Colour and marker in Matplotlib pictures; the colour has a contrast of at least 3:1."""
+
+
+GROUPS = {
+    "plant": Group("knows the plant exactly", "#000000", "*"),
+    "step test": Group("knows a step test of the plant", "#0072B2", "s"),
+    "simulator": Group("settings from a simulator", "#007A5A", "D"),
+    "paper": Group("two gains from the paper", "#9B2F8C", "X"),
+    "own": Group("your own", "#C04A00", "o"),
+    "nothing": Group("knows nothing", "#666666", "P"),
+}
+"""The groups of controllers by a short name, in the order of pictures."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ControllerSpec:
     """The record of a controller: everything that commands need to run and describe it.
@@ -40,8 +62,8 @@ class ControllerSpec:
         Name of the controller in command-line options and files.
     label : str
         Name of the controller in tables and pictures.
-    look : tuple of str
-        Colour and marker of the controller in Matplotlib pictures.
+    group : str
+        Key of the group in `GROUPS` to which the controller belongs, by its prior knowledge.
     make : callable
         Function `make(plant, runs, seed)` that returns a controller for a batch of `runs` runs,
         or the controller and a dict of the arguments of its environment, such as
@@ -63,13 +85,15 @@ class ControllerSpec:
         fits plants of both signs.
     random : bool
         Whether the controller draws random numbers, such as initial weights.
+    learns : bool
+        Whether the controller learns during a run, which pictures say.
     compared : bool
         Whether the command `compare` runs the controller by default.
     """
 
     name: str
     label: str
-    look: tuple[str, str]
+    group: str
     make: Callable[..., Any]
     knows: str = ""
     searched: str = ""
@@ -77,7 +101,14 @@ class ControllerSpec:
     trainings: Sequence[str] = ()
     direction: int | None = None
     random: bool = False
+    learns: bool = False
     compared: bool = True
+
+    @property
+    def prior_knowledge(self) -> str:
+        """What the controller knows before a run, in a few words, and whether it learns."""
+        title = GROUPS[self.group].title
+        return f"{title}; learns in the run" if self.learns else title
 
     def members(self) -> "list[ControllerSpec]":
         """Return a record for each training, or `[self]` without trainings."""
@@ -238,7 +269,7 @@ _SPECS = (
     ControllerSpec(
         name="idle",
         label="idle valve",
-        look=("#8C8C8C", "x"),
+        group="nothing",
         make=idle,
         knows="nothing",
         searched="nothing",
@@ -247,7 +278,8 @@ _SPECS = (
     ControllerSpec(
         name="nn",
         label="NN (1992)",
-        look=("#D55E00", "o"),
+        group="simulator",
+        learns=True,
         make=nn,
         knows="sign of the gain; settings searched on the paper's plant",
         searched="25 weights in the run itself; 6 settings by the search of version 0.1; the "
@@ -257,7 +289,7 @@ _SPECS = (
     ControllerSpec(
         name="pi",
         label="PI (1992)",
-        look=("#CC79A7", "s"),
+        group="paper",
         make=pi,
         knows="gains of the paper, for its plant",
         searched="2 gains; the paper does not say how they were found",
@@ -266,7 +298,7 @@ _SPECS = (
     ControllerSpec(
         name="pi-simc",
         label="PI (SIMC)",
-        look=("#9B2F8C", "h"),
+        group="step test",
         make=pi_simc,
         knows=_KNOWS_STEP_TEST,
         searched=_TUNING_RULE,
@@ -274,7 +306,7 @@ _SPECS = (
     ControllerSpec(
         name="pi-searched",
         label="PI (searched)",
-        look=("#5A1220", "p"),
+        group="simulator",
         make=pi,
         arguments=SEARCHED_GAINS,
         knows="gains searched on the paper's plant",
@@ -285,7 +317,7 @@ _SPECS = (
     ControllerSpec(
         name="smith",
         label="Smith",
-        look=("#56B4E9", "^"),
+        group="step test",
         make=smith,
         knows=_KNOWS_DATA_SHEET,
         searched=_TUNING_RULE,
@@ -293,7 +325,7 @@ _SPECS = (
     ControllerSpec(
         name="dahlin",
         label="Dahlin",
-        look=("#003F7D", "<"),
+        group="step test",
         make=dahlin,
         knows=_KNOWS_DATA_SHEET,
         searched=f"{_TUNING_RULE}; closed-loop time constant by hand: a tenth of the plant's",
@@ -301,7 +333,8 @@ _SPECS = (
     ControllerSpec(
         name="self-tuning",
         label="self-tuning",
-        look=("#5FCF9F", "v"),
+        group="step test",
+        learns=True,
         make=self_tuning,
         knows=f"{_KNOWS_DATA_SHEET}; delay range; hold times of random set points",
         searched="about 70 settings by hand; one step test",
@@ -309,7 +342,7 @@ _SPECS = (
     ControllerSpec(
         name="mpc",
         label="MPC",
-        look=("#000000", "*"),
+        group="plant",
         make=mpc,
         knows="everything except the future",
         searched="nothing",
@@ -317,7 +350,7 @@ _SPECS = (
     ControllerSpec(
         name="ppo",
         label="PPO",
-        look=("#E69F00", "D"),
+        group="simulator",
         make=ppo,
         trainings=_trained("ppo-[0-9]*.npz"),
         knows="dead zone; trained on a simulator of the paper's plant",
@@ -328,7 +361,7 @@ _SPECS = (
     ControllerSpec(
         name="ppo-hard",
         label="PPO (hard)",
-        look=("#8F6200", "D"),
+        group="simulator",
         make=ppo,
         trainings=_trained("ppo-hard-*.npz"),
         knows="limits; trained on a simulator of the plants of the preset hard",
