@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from copy import copy
-from typing import Any, ClassVar, cast
+from copy import copy, deepcopy
+from typing import Any, ClassVar, NamedTuple, cast
 
 import gymnasium
 import numpy as np
@@ -78,6 +78,22 @@ class HasJsonSpec:
             if limit is not None:
                 spec.max_episode_steps = None if limit == -1 else limit
         self._spec = spec
+
+
+class _State(NamedTuple):
+    """What `MiddlePointEnv.get_state` returns; nothing in it changes after that."""
+
+    parameters: Parameters
+    plant: Plant
+    wanted_flow: WantedFlow | None
+    action: float
+    window: list[float]
+    coming_signals: list[tuple[float, ...]]
+    signals: Signals
+    streams: list[RandomStreams]
+    continues_streams: bool  # whether a reset without a seed goes on with `streams`
+    seed: int | None
+    np_random: Any  # state of the bit generator
 
 
 class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
@@ -236,11 +252,12 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     ## Copies
 
     A deep copy or a pickle in mid-episode continues the same episode: noise, load and set
-    points to come are those of the original, even if the copy gets another `np_random`. A
-    planner that tries actions on copies therefore foresees them, which no controller of a real
-    plant can. A planner should try actions in an environment of its own, made without noise and
-    load and with the set point that it expects, to which it applies every action that the plant
-    receives.
+    points to come are those of the original, even if the copy gets another `np_random`. So does
+    an environment that `set_state` brings back to a state of `get_state`, which is much faster
+    than a copy. A planner that tries actions on copies or from a state therefore foresees them,
+    which no controller of a real plant can. A planner should try actions in an environment of
+    its own, made without noise and load and with the set point that it expects, to which it
+    applies every action that the plant receives.
 
     ## Rendering
 
@@ -291,6 +308,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         self._plant_sampler = PlantSampler(parameters)
         self._wanted_flow: WantedFlow | None = None  # for the action form "change" alone
         self._signals = Signals.of(parameters)
+        # Whether a state of `get_state` refers to `_signals` and `_streams`.
+        self._signals_are_shared = False
         # Random number streams of the environment's plant; empty before the first reset.
         self._streams: list[RandomStreams] = []
         # The random number generator from whose seed the streams start.
@@ -326,6 +345,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
             are ranges.
         """
         super().reset(seed=seed)
+        self._own_signals()
         if self._root is not self.np_random:  # at the first reset, or after a new seed
             self._root = self.np_random
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
@@ -399,6 +419,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         if not self._coming_signals:
             if not self._streams:  # random number streams, which the first reset makes
                 raise ResetNeeded("call reset before step")
+            self._own_signals()
             # In reverse order, because `pop` returns the last element of the list.
             self._coming_signals = self._signals.ahead()[::-1]
         setpoint, noise, load, measurement_noise = self._coming_signals.pop()
@@ -448,6 +469,82 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
             if self.render_mode == "human":
                 self.render()
         return observation, reward, False, False, info
+
+    def get_state(self) -> Any:
+        """Return the present state, with which `set_state` continues from the present sample.
+
+        With wrappers, write `env.unwrapped.get_state()`; wrappers such as a time limit keep a
+        state of their own. The section on copies in the docstring of the class says what a
+        planner that tries actions from a state foresees.
+
+        Returns
+        -------
+        state
+            The state of plant, observation, signals and all random numbers except those of the
+            spaces. Its contents are not public. Any number of calls of `set_state` can use a
+            state, which can be pickled.
+
+        Raises
+        ------
+        ResetNeeded
+            If `get_state` is called before the first `reset`.
+        """
+        if not self._streams:
+            raise ResetNeeded("call reset before get_state")
+        self._signals_are_shared = True
+        return _State(
+            parameters=self.parameters,
+            plant=copy(self._plant),
+            wanted_flow=copy(self._wanted_flow),
+            action=self._action,
+            window=self._window.copy(),
+            coming_signals=self._coming_signals.copy(),
+            signals=self._signals,
+            streams=self._streams,
+            continues_streams=self._root is self.np_random,
+            seed=self.np_random_seed,
+            np_random=self.np_random.bit_generator.state,
+        )
+
+    def set_state(self, state: Any) -> None:
+        """Bring the environment back to a state, after which steps and resets are as after it.
+
+        Only the picture of `render` is not brought back; it also shows the samples since then.
+
+        Parameters
+        ----------
+        state
+            A state of this environment, or of another `MiddlePointEnv` with equal arguments.
+
+        Raises
+        ------
+        ValueError
+            If the environment of the state had other arguments.
+        """
+        if state.parameters != self.parameters:
+            raise ValueError("the state is that of an environment with other arguments")
+        self._plant = copy(state.plant)
+        self._wanted_flow = copy(state.wanted_flow)
+        self._action = state.action
+        self._window = state.window.copy()
+        self._coming_signals = state.coming_signals.copy()
+        self._signals_are_shared = True
+        self._signals = state.signals
+        self._streams = state.streams
+        self.np_random.bit_generator.state = state.np_random
+        self._np_random_seed = state.seed
+        self._root = self.np_random if state.continues_streams else None
+
+    def _own_signals(self) -> None:
+        """Copy signals and streams to which a state refers, before they change.
+
+        They change so rarely, when a block of signals is generated and when an episode begins,
+        that states refer to them instead of holding copies.
+        """
+        if self._signals_are_shared:
+            # In one call, as the signals refer to the streams.
+            self._signals, self._streams = deepcopy((self._signals, self._streams))
+            self._signals_are_shared = False
 
     def render(self) -> Frame | None:
         """Return or show a picture of the latest samples of the episode.

@@ -1,6 +1,7 @@
 """Check the environment against its specification, also what is off by default."""
 
 import inspect
+import pickle
 import warnings
 from functools import partial
 
@@ -8,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -350,3 +352,62 @@ def assert_equal_records(record, other):
     assert set(record) == set(other)
     for name in record:
         np.testing.assert_array_equal(record[name], other[name])
+
+
+CHANGE = {"action": "change", "compensated_dead_zone": 5.0, "action_window": 3}
+
+
+@pytest.mark.parametrize("arguments", [{}, PRESETS["hard"], {**PRESETS["hard"], **CHANGE}])
+@pytest.mark.parametrize("steps", [0, 43, 599])  # 600 samples are generated at a time
+def test_after_set_state_steps_and_episodes_are_as_if_nothing_had_been_tried(
+    arguments, steps, rng
+):
+    actions = rng.uniform(-1.2, 1.2, 1500)
+    env, untouched = MiddlePointEnv(**arguments), MiddlePointEnv(**arguments)
+    env.reset(seed=3)
+    untouched.reset(seed=3)
+    for a in actions[:steps]:
+        env.step(np.array([a]))
+        untouched.step(np.array([a]))
+    state = env.get_state()
+    tried = []
+    for _ in range(2):  # the second time from the same state
+        tried.append(_continue(env, actions[:700]))  # also resets
+        env.set_state(state)
+    assert tried[0] == tried[1]
+    env.reset(seed=8)
+    env.np_random.random()
+    elsewhere = MiddlePointEnv(**arguments)
+    elsewhere.set_state(state)  # while the episode of `env` goes on
+    env.set_state(state)
+    expected = _continue(untouched, actions[700:])
+    assert _continue(env, actions[700:]) == expected
+    env.reset(seed=9)
+    assert _continue(elsewhere, actions[700:]) == expected
+    assert elsewhere.np_random_seed == untouched.np_random_seed == 3
+    elsewhere.set_state(pickle.loads(pickle.dumps(state)))
+    assert _continue(elsewhere, actions[700:]) == expected
+
+
+def _continue(env, actions):
+    """Step, begin another episode, and return all that was seen and the next random number."""
+    seen = []
+    for a in actions:
+        observation, reward, _, _, info = env.step(np.array([a]))
+        seen.append((observation.tolist(), reward, info))
+    observation, info = env.reset()
+    seen.append((observation.tolist(), info))
+    for a in actions[:50]:
+        observation = env.step(np.array([a]))[0]
+        seen.append((observation.tolist(), env.np_random.random()))
+    return seen
+
+
+def test_states_need_an_episode_and_equal_arguments():
+    env = MiddlePointEnv()
+    with pytest.raises(ResetNeeded):
+        env.get_state()
+    env.reset(seed=0)
+    MiddlePointEnv(noise_variance=0.0).set_state(env.get_state())  # the default
+    with pytest.raises(ValueError, match="other arguments"):
+        MiddlePointEnv(delay=3).set_state(env.get_state())

@@ -171,6 +171,15 @@ class Plant:
         # Pairs of the index of a past flow in `_flows` and the coefficient of B for this flow.
         self._beta = tuple(enumerate(parameters.b, start=delay))
 
+    def __copy__(self) -> "Plant":
+        """Return a plant in the same state, whose steps do not change this plant."""
+        duplicate = object.__new__(Plant)
+        vars(duplicate).update(vars(self))
+        # All else is replaced by `step` and never changed in place.
+        duplicate._outputs = self._outputs.copy()
+        duplicate._flows = self._flows.copy()
+        return duplicate
+
     def step(self, action: float, noise: float, load: float) -> tuple[float, float, float]:
         """Move the plant from sample k to sample k+1.
 
