@@ -10,7 +10,6 @@ from importlib import resources
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mptc_gym.plant.actuator import action_from_command
 from mptc_gym.plant.checks import count
@@ -25,9 +24,15 @@ from mptc_gym.rollout import (
     rollout,
     start,
 )
+from mptc_gym.scores import (
+    Values,
+    mean_absolute_error,
+    score,
+    score_interval,
+    scores,
+    valve_travel,
+)
 from mptc_gym.vector_env import MiddlePointVectorEnv, parameters_of
-
-Values = NDArray[np.float64]  # one number for each episode, shape (episodes,)
 
 # Seed of the first episode, unless the caller asks for another seed; episode i has `SEED + i`.
 # The seed is arbitrary, but never changes, so that published scores remain comparable.
@@ -40,7 +45,6 @@ VALIDATION_EPISODES: Final = 200  # validation episodes with a known reference e
 # Arguments of an environment that change observations or rewards, but not the error of an ideal
 # controller.
 _WITHOUT_EFFECT_ON_REFERENCE: Final = *INTERFACE, "reward", "error_scale", "move_weight"
-_RESAMPLES: Final = 2000  # number of bootstrap samples for the interval of a score
 _VALVE_IDLE: Final = (  # a note on episodes
     "the valve never moved: score the policy in the action form of its training, or choose "
     'actions that leave the dead zone, as with action="change" and a compensated_dead_zone'
@@ -212,9 +216,7 @@ valve travel 10 t/h; 100 episodes, all alike
     first = count("seed", seed, 0, 2**63 - 1)
     seeds = range(first, first + episodes)
     with opened(policy, env, episodes, arguments) as plants:
-        case = case_of(
-            parameters_of(plants)
-        )  # without the arguments that change no reference error
+        case = case_of(parameters_of(plants))
         # A user's code or wrapper may alter the episodes. Environments that are made from an id
         # without wrappers are one batch, which has no attribute `envs`.
         is_alterable = callable(env) or any("envs" in vars(layer) for layer in layers(plants))
@@ -270,28 +272,28 @@ def _run(
         samples = rollout(plants, start(policy, n), EPISODE_STEPS, seeds_of_round)
         if is_replayed:
             samples = replayed(samples, case, seeds_of_round)
-        rounds.append(_measure(samples, n))
+        rounds.append(_measure(samples))
     # The plants run at the same time, so there may be more episodes than seeds.
     errors = np.hstack([runs.errors for runs in rounds])[: len(seeds)]
     travels = np.hstack([runs.travels for runs in rounds])[: len(seeds)]
     return _Runs(errors, travels, min(runs.length for runs in rounds))
 
 
-def _measure(samples: Iterator[Sample], n: int) -> _Runs:
-    """Return the mean errors and valve travels of n plants from the samples of one episode."""
+def _measure(samples: Iterator[Sample]) -> _Runs:
+    """Return the mean errors and valve travels of plants from the samples of one episode."""
     next(samples)  # skip sample k = 0, which the policy cannot affect
-    total_errors = np.zeros(n)
-    travels = np.zeros(n)
-    applied = np.zeros(n)  # applied flow, t/h, which is 0 at rest
-    length = 0
+    errors: list[Values] = []
+    flows: list[Values] = []  # The infos of sample k have the flow of sample k - 1.
     for sample in samples:
-        length += 1
-        total_errors += np.abs(sample.infos["error"])
-        travels += np.abs(sample.infos["applied"] - applied)
-        applied = sample.infos["applied"]
+        errors.append(sample.infos["error"])
+        flows.append(sample.infos["applied"])
         if sample.ended.all():
             break
-    return _Runs(total_errors / length, travels, length)
+    return _Runs(
+        errors=mean_absolute_error(np.array(errors)),
+        travels=valve_travel(np.array(flows)),
+        length=len(errors),
+    )
 
 
 class StoredReference(NamedTuple):
@@ -375,26 +377,18 @@ def _idle_errors(parameters: Parameters, seeds: range) -> Values:
     idle_action = action_from_command(0.0, parameters.u_min, parameters.u_max)
     idle_actions = np.full((n, 1), idle_action)
     samples = rollout(plants, lambda _: idle_actions, EPISODE_STEPS, [*seeds])
-    return _measure(samples, n).errors
+    return _measure(samples).errors
 
 
 def _with_scores(evaluation: Evaluation, references: Values, idle_errors: Values) -> Evaluation:
     """Return a copy of `evaluation` with the reference errors and the scores."""
-    gained = idle_errors - evaluation.errors
-    possible = idle_errors - references
-    n = len(gained)
-    generator = np.random.default_rng(0)
-    resampled_scores = []
-    for _ in range(_RESAMPLES):
-        resample = generator.integers(n, size=n)  # indices of episodes, drawn with replacement
-        resampled_scores.append(gained[resample].mean() / possible[resample].mean())
-    low, high = np.quantile(resampled_scores, (0.025, 0.975)).tolist()
+    errors = evaluation.errors
     return replace(
         evaluation,
         reference=float(references.mean()),
-        ratio=float(evaluation.errors.mean() / references.mean()),
-        score=float(gained.mean() / possible.mean()),
-        interval=(low, high),
+        ratio=float(errors.mean() / references.mean()),
+        score=score(errors, idle_errors, references),
+        interval=score_interval(errors, idle_errors, references),
         references=references,
-        scores=gained / possible,
+        scores=scores(errors, idle_errors, references),
     )

@@ -37,6 +37,7 @@ from mptc_gym import Parameters
 from mptc_gym.evaluation import EPISODES, SEED
 from mptc_gym.plant.parameters import ARGUMENTS, PlantNumbers
 from mptc_gym.plant.sampling import plant_numbers
+from mptc_gym.scores import mean_absolute_error, scores
 
 Array = NDArray[np.float64]
 
@@ -96,8 +97,7 @@ class Reference(Estimate):
                 f"a score needs an idle-valve error above the reference error of "
                 f"{self.value:g} °C, got {idle:g} °C"
             )
-        scores: Array = (idle - np.asarray(errors, np.float64)) / (idle - self.value)
-        return scores
+        return scores(errors, idle, self.value)
 
 
 def reference_error(
@@ -179,7 +179,7 @@ def _episodes_of(parameters: Parameters, samples: int, episodes: int, seed: int)
     return _Episodes(
         numbers=[plant_numbers(numbers, i) for i in range(episodes)],
         setpoints=trajectory.setpoint.T,
-        idle_errors=np.abs(trajectory.setpoint - trajectory.output)[1:].mean(axis=0),
+        idle_errors=mean_absolute_error((trajectory.setpoint - trajectory.output)[1:]),
     )
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import scipy  # SciPy loads its modules on first use.
 from numpy.typing import ArrayLike, NDArray
 
-INTERVAL_ENDS = 0.025, 0.975  # the quantiles that are the ends of a 95 % interval
-RESAMPLES = 2000  # number of resamples of a bootstrap; with more, the interval hardly changes
+from mptc_gym.scores import INTERVAL_ENDS, RESAMPLES
 
 
 @dataclass(frozen=True)

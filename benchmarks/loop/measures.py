@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from benchmarks.loop.runs import Trajectory
 from mptc_gym import Parameters
 from mptc_gym.plant.actuator import least_effective_command
+from mptc_gym.scores import mean_absolute_error, valve_travel
 
 Array = NDArray[np.float64]
 
@@ -56,13 +57,12 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
         _measure_steps(setpoint, output)
         for setpoint, output in zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
     ]
-    moves = np.diff(trajectory.applied, axis=0, prepend=0.0)
     return {
         "mae": mean_error(trajectory),
         **_parts_of_error(trajectory),
         "ise": interval * np.square(errors).sum(axis=0),
         "itae": interval**2 * np.array([run.itae for run in step_measures]),
-        "total_variation": np.abs(moves).sum(axis=0),
+        "total_variation": valve_travel(trajectory.applied),
         "overshoot": 100.0 * np.array([run.overshoot for run in step_measures]),
         "settling_time": interval * np.array([run.settling_time for run in step_measures]),
         **_actuator_shares(trajectory.command, parameters),
@@ -160,11 +160,8 @@ def held(setpoint: Array) -> list[tuple[int, int]]:
 
 
 def mean_error(trajectory: Trajectory) -> Array:
-    """Return the mean absolute error of each run, degC, shape (runs,).
-
-    The mean is over the samples k = 1 to N, since no controller can change the error at k = 0.
-    """
-    return np.asarray(np.abs(trajectory.next_error).mean(axis=0))
+    """Return the mean absolute error of each run, degC, shape (runs,)."""
+    return mean_absolute_error(trajectory.next_error)
 
 
 def settled(trajectory: Trajectory) -> NDArray[np.bool_]:
