@@ -154,7 +154,7 @@ def opened(policy: Any, env: Any, n: int, arguments: Mapping[str, Any]) -> Itera
     plants = _make_plants(policy, env, n, arguments)
     try:
         _freeze_statistics(plants)
-        _check_fit(policy, plants, is_made_by_user=callable(env))
+        check_fit(policy, plants, is_made_by_user=callable(env))
         yield plants
     finally:
         plants.close()
@@ -265,7 +265,7 @@ def _freeze_statistics(plants: Plants) -> None:
             )
 
 
-def _check_fit(policy: Any, plants: Plants, *, is_made_by_user: bool) -> None:
+def check_fit(policy: Any, plants: Plants, *, is_made_by_user: bool) -> None:
     """Raise a ValueError if a controller or a model was made for other environments."""
     parameters = parameters_of(plants)
     if hasattr(policy, "check_environment"):

@@ -202,18 +202,29 @@ class TestCompare:
         readme = (ROOT / "benchmarks/compare/README.md").read_text(encoding="utf-8")
         (example,) = re.findall(r"```python\n(from agents import PIC.*?)```", readme, re.DOTALL)
         (option,) = re.findall(r"--agent (\w+=my_\S+)`", readme)
-        (tmp_path / "my_controllers.py").write_text(example)
+        bad_example = "def bad():\n    return lambda observations: 1 / 0\n"
+        (tmp_path / "my_controllers.py").write_text(f"{example}\n{bad_example}")
         monkeypatch.syspath_prepend(tmp_path)
-        bad = "--agent bad=my_controllers:Mine --agent worse=my_controllers:PIController.x"
+        bad = "--agent bad=my_controllers:bad"
         given = f"--agents --agent {option} {bad} --scenarios constant --runs 1"
         out = compared(given, status=1)
         errors = pd.read_csv(out / "runs.csv")["mae"].tolist()
         assert errors == pytest.approx([0.283], abs=0.001)  # that of the gains
         said = capsys.readouterr().err
-        assert "2 of 4 tasks are missing" in said
-        assert "bad, constant: " in said
-        assert "module 'my_controllers' has no attribute 'Mine'" in said
-        assert "**Unfinished: 2 of 4 tasks are missing.**" in (out / "report.md").read_text()
+        assert "1 of 3 tasks are missing" in said
+        assert "bad, constant: ZeroDivisionError" in said
+        assert "**Unfinished: 1 of 3 tasks are missing.**" in (out / "report.md").read_text()
+
+    def test_what_evaluate_refuses_is_refused_before_the_tasks(
+        self, tmp_path, monkeypatch, refused
+    ):
+        code = "from agents import PIController\ndef fixed():\n    return PIController()\n"
+        (tmp_path / "with_limits.py").write_text(code)
+        monkeypatch.syspath_prepend(tmp_path)
+        words = "--agents pi --agent mine=with_limits:fixed --set u_min=0 --set u_max=20"
+        said = refused(main, [*words.split(), "--out", str(tmp_path / "out")])
+        assert "--agent mine, square: policy must have the flow limits of env" in said
+        assert not (tmp_path / "out").exists()
 
     @pytest.mark.usefixtures("undrawn")
     def test_after_an_interruption_there_is_a_report_on_what_has_finished(

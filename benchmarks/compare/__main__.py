@@ -1,12 +1,13 @@
 """Compare controllers in the same noise: `python -m benchmarks.compare --help`."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Annotated, Any
 
 from benchmarks.controllers.known_plant import KnownPlant
-from benchmarks.controllers.own import own_controllers
+from benchmarks.controllers.own import check_own, own_controllers
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
 from benchmarks.lib.command import (
     CommandError,
@@ -66,16 +67,22 @@ class Options:
 def work(options: Options) -> None:
     """Compare controllers, write the results, and print a table and the path of the report.
 
-    If a task fails or the user interrupts the comparison, the results of the controllers that
-    have finished are written before an error is raised.
+    A user's own controllers are checked before the first task begins. If a task fails or the
+    user interrupts the comparison, the results of the controllers that have finished are
+    written before an error is raised.
     """
     from benchmarks.compare.cases import Result, reference_of, run_case
     from benchmarks.compare.report import write
 
-    chosen = choose("--agents", options.agents, ROSTER) | own_controllers(options.agent)
+    own = own_controllers(options.agent)
+    chosen = choose("--agents", options.agents, ROSTER) | own
     controllers, note = fitting_the_gain(chosen, options.plant)
     folder_name, scenarios = cases(options)
     runs, seed = options.runs, options.seed
+    # The roster makes its controllers for the plant of each scenario, so they fit.
+    of_user = [controller for name, controller in controllers.items() if name in own]
+    for controller, scenario in itertools.product(of_user, scenarios.values()):
+        check_own(controller, scenario, runs, seed)
     provenance = provenance_of(
         options={**asdict(options), "agents": list(controllers)},
         seeds=list(range(seed, seed + runs)),

@@ -35,8 +35,10 @@ class KnownPlant:
 
     Attributes
     ----------
+    arguments : dict
+        Arguments of the environment that differ from the defaults.
     parameters : Parameters
-        All arguments of the environment.
+        All arguments of the environment, with the defaults filled in.
     limits : dict
         Limits of the flow, `u_min` and `u_max`, t/h.
     dead_zone, widest_dead_zone : float
@@ -50,6 +52,7 @@ class KnownPlant:
 
     def __init__(self, arguments: Mapping[str, Any]) -> None:
         parameters = Parameters(**arguments)
+        self.arguments = dict(arguments)
         self.parameters = parameters
         self.limits: dict[str, Any] = {"u_min": parameters.u_min, "u_max": parameters.u_max}
         self.dead_zone = sum(parameters.range_of("dead_zone")) / 2

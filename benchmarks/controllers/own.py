@@ -1,4 +1,4 @@
-"""Read the values of the option `--agent`: a user's own controllers.
+"""Make and check a user's own controllers, the values of the option `--agent`.
 
 A *factory* is a user's function or class that returns a policy. The page
 `benchmarks/compare/README.md` describes its arguments and its result.
@@ -11,12 +11,15 @@ import pkgutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from agents import PolicyNetwork
 from benchmarks.controllers.known_plant import KnownPlant
-from benchmarks.controllers.roster import ROSTER, ControllerSpec
+from benchmarks.controllers.roster import ROSTER, ControllerSpec, Made
 from benchmarks.lib.command import CommandError
+from benchmarks.loop.runs import make_plants
+from benchmarks.loop.scenarios import Scenario
+from mptc_gym.plant.parameters import INTERFACE
+from mptc_gym.rollout import check_fit
 
 FORMS = (
     "NAME=MODULE:FACTORY, NAME=gains.json of benchmarks.tune, or NAME=FILE.npz of "
@@ -100,14 +103,43 @@ def _with_trained_networks(files: Sequence[str]) -> ControllerSpec:
     )
 
 
-def from_factory(plant: KnownPlant, runs: int, seed: int, training: str) -> Any:
-    """Call a user's factory, and return what it returns.
+def from_factory(plant: KnownPlant, runs: int, seed: int, training: str) -> Made:
+    """Call a user's factory, and return the policy and the arguments of its environment.
 
     Of `num_envs`, `seed`, `u_min`, `u_max` and `parameters` (all arguments of the environment),
     the factory gets those that are named in its signature. `training` is the location of the
-    factory, in the form MODULE:FACTORY.
+    factory, in the form MODULE:FACTORY. A ValueError is raised if the factory chooses another
+    plant, or returns a model whose normalisation statistics would be left out.
     """
     factory = pkgutil.resolve_name(training)
     offered = {"num_envs": runs, "seed": seed, "parameters": plant.parameters, **plant.limits}
     wanted = inspect.signature(factory).parameters
-    return factory(**{name: offered[name] for name in offered if name in wanted})
+    made = factory(**{name: offered[name] for name in offered if name in wanted})
+    policy, interface = made if isinstance(made, tuple) else (made, {})
+    changes = set(interface) - set(INTERFACE)
+    if changes:  # With another plant, the controller would be compared unfairly.
+        raise ValueError(
+            f"a controller may choose {', '.join(INTERFACE)}, got {', '.join(changes)}"
+        )
+    # The plants of a comparison have no wrappers, so the statistics would be left out.
+    if getattr(policy, "get_vec_normalize_env", lambda: None)() is not None:
+        raise ValueError(
+            "a model with VecNormalize must come as a function of the observations, as "
+            "ppo_normalised in benchmarks/examples/train_your_own.md"
+        )
+    return policy, {**plant.arguments, **interface}
+
+
+def check_own(controller: ControllerSpec, scenario: Scenario, runs: int, seed: int) -> None:
+    """Refuse a user's own controller that does not fit the plants of a scenario.
+
+    A `CommandError` is raised for a controller that `mptc_gym.evaluate` would refuse, such as
+    one with other limits of the flow, and for what `from_factory` refuses.
+    """
+    try:
+        for member in controller.members():
+            policy, arguments = member.start(scenario.arguments, runs, seed)
+            plants = make_plants(runs, scenario.samples, **arguments)
+            check_fit(policy, plants, is_made_by_user=True)
+    except ValueError as error:
+        raise CommandError(f"--agent {controller.name}, {scenario.name}: {error}") from error

@@ -22,12 +22,14 @@ from agents.pi import SEARCHED_GAINS
 from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
 from benchmarks.loop.runs import Agent, IdleValve, Trajectory, make_plants, simulate
-from mptc_gym.plant.parameters import INTERFACE, PAPER_WINDOWS
+from mptc_gym.plant.parameters import PAPER_WINDOWS
 
 # Ratio of the closed-loop time constant of Dahlin's controller to the plant's time constant.
 # The small ratio makes the control loop fast; the filter time constant makes the control loop
 # robust.
 LAMBDA = 0.1
+
+Made = tuple[Agent, dict[str, Any]]  # a controller and the arguments of its environment
 
 
 @dataclass(frozen=True)
@@ -66,9 +68,9 @@ class ControllerSpec:
         Key of the group in `GROUPS` to which the controller belongs, by its prior knowledge.
     make : callable
         Function `make(plant, runs, seed)` that returns a controller for a batch of `runs` runs,
-        or the controller and a dict of the arguments of its environment, such as
-        `{"action_window": 20}`. `plant` is a `KnownPlant`, and the controller draws random
-        numbers for run i with the seed `seed + i`.
+        and the arguments of its environment: those of the plant, and those of its observations
+        and actions, such as `action_window=20`. `plant` is a `KnownPlant`, and the controller
+        draws random numbers for run i with the seed `seed + i`.
     knows : str
         Text for tables that describes the prior knowledge of the controller.
     searched : str
@@ -94,7 +96,7 @@ class ControllerSpec:
     name: str
     label: str
     group: str
-    make: Callable[..., Any]
+    make: Callable[..., Made]
     knows: str = ""
     searched: str = ""
     arguments: Mapping[str, Any] = field(default_factory=dict)
@@ -111,42 +113,24 @@ class ControllerSpec:
         return f"{title}; learns in the run" if self.learns else title
 
     def members(self) -> "list[ControllerSpec]":
-        """Return a record for each training, or `[self]` without trainings."""
+        """Return the controllers to start: one for each training, or this one if none."""
         members = [
             replace(self, arguments={"training": training}, trainings=())
             for training in self.trainings
         ]
         return members or [self]
 
-    def start(
-        self, plant: Mapping[str, Any], runs: int, seed: int
-    ) -> tuple[Agent, dict[str, Any]]:
-        """Return a new controller for a batch, and the arguments of its environment.
+    def start(self, plant: Mapping[str, Any], runs: int, seed: int) -> Made:
+        """Make a controller for a batch, and return it with the arguments of its environment.
 
-        `plant` are arguments of the environment. The returned arguments define the plant and
-        the controller's observation.
+        `plant` are arguments of the environment that define the plant and the set point.
         """
-        # A controller gets the paper's windows, or those for which its `make` asks.
-        arguments = {**plant, **PAPER_WINDOWS}
-        agent = self.make(KnownPlant(arguments), runs, seed, **self.arguments)
-        if isinstance(agent, tuple):
-            agent, interface = agent
-            changes = set(interface) - set(INTERFACE)
-            if changes:  # With another plant, the controller would be compared unfairly.
-                raise ValueError(
-                    f"a controller may choose {', '.join(INTERFACE)}, got {', '.join(changes)}"
-                )
-            arguments |= interface
-        # The plants of a comparison have no wrappers, so the statistics would be left out.
-        if getattr(agent, "get_vec_normalize_env", lambda: None)() is not None:
-            raise ValueError(
-                "a model with VecNormalize must come as a function of the observations, as "
-                "ppo_normalised in benchmarks/examples/train_your_own.md"
-            )
-        return agent, arguments
+        # A controller observes the paper's windows, unless its `make` returns others.
+        known = KnownPlant({**plant, **PAPER_WINDOWS})
+        return self.make(known, runs, seed, **self.arguments)
 
     def run(self, plant: Mapping[str, Any], samples: int, runs: int, seed: int) -> Trajectory:
-        """Run a new controller on a batch of plants, and return the signals of the runs.
+        """Start a controller, run it on a batch of plants, and return the signals of the runs.
 
         Parameters
         ----------
@@ -164,24 +148,27 @@ class ControllerSpec:
         return simulate(make_plants(runs, samples, **arguments), agent, samples, seed)
 
 
-def idle(plant: KnownPlant, runs: int, seed: int) -> Agent:
+def idle(plant: KnownPlant, runs: int, seed: int) -> Made:
     """Return a controller that keeps the flow at 0 t/h."""
-    return IdleValve(**plant.limits)
+    return IdleValve(**plant.limits), plant.arguments
 
 
-def nn(plant: KnownPlant, runs: int, seed: int, **gains: float) -> Agent:
+def nn(plant: KnownPlant, runs: int, seed: int, **gains: float) -> Made:
     """Return the paper's network, which knows the sign of the gain and learns the rest."""
     arguments: dict[str, Any] = {**plant.limits, **gains}
-    return DirectNNController(direction=plant.direction, num_envs=runs, seed=seed, **arguments)
+    network = DirectNNController(
+        direction=plant.direction, num_envs=runs, seed=seed, **arguments
+    )
+    return network, plant.arguments
 
 
-def pi(plant: KnownPlant, runs: int, seed: int, **gains: float) -> Agent:
+def pi(plant: KnownPlant, runs: int, seed: int, **gains: float) -> Made:
     """Return a PI controller with fixed gains, by default those of the paper."""
     arguments: dict[str, Any] = {**plant.limits, **gains}
-    return PIController(**arguments)
+    return PIController(**arguments), plant.arguments
 
 
-def pi_simc(plant: KnownPlant, runs: int, seed: int) -> Agent:
+def pi_simc(plant: KnownPlant, runs: int, seed: int) -> Made:
     """Return a PI controller that the rule SIMC tunes to a step test."""
 
     def simc(time_constant: float) -> PIController:
@@ -189,10 +176,10 @@ def pi_simc(plant: KnownPlant, runs: int, seed: int) -> Agent:
             closed_loop_time_constant=time_constant, **plant.step_test, **plant.limits
         )
 
-    return plant.robust(simc)
+    return plant.robust(simc), plant.arguments
 
 
-def smith(plant: KnownPlant, runs: int, seed: int) -> Agent:
+def smith(plant: KnownPlant, runs: int, seed: int) -> Made:
     """Return a Smith predictor that knows a step test, the dead zone and the limits."""
 
     def predictor(time_constant: float) -> SmithPredictor:
@@ -203,10 +190,10 @@ def smith(plant: KnownPlant, runs: int, seed: int) -> Agent:
             **plant.limits,
         )
 
-    return plant.robust(predictor)
+    return plant.robust(predictor), plant.arguments
 
 
-def dahlin(plant: KnownPlant, runs: int, seed: int) -> Agent:
+def dahlin(plant: KnownPlant, runs: int, seed: int) -> Made:
     """Return Dahlin's controller, which knows a step test, the dead zone and the limits."""
 
     def controller(filter_time_constant: float) -> DahlinController:
@@ -218,16 +205,16 @@ def dahlin(plant: KnownPlant, runs: int, seed: int) -> Agent:
             **plant.limits,
         )
 
-    return plant.robust(controller)
+    return plant.robust(controller), plant.arguments
 
 
-def self_tuning(plant: KnownPlant, runs: int, seed: int) -> Agent:
+def self_tuning(plant: KnownPlant, runs: int, seed: int) -> Made:
     """Return a self-tuning controller, which selects the best of a bank of plant models.
 
     The controller knows a step test, the limits, the largest dead zone, and the ranges of the
     delay and of the set points.
     """
-    return SelfTuningController(
+    controller = SelfTuningController(
         dead_zone=plant.widest_dead_zone,
         delay_range=plant.delay_range,
         setpoint_holds=plant.setpoint_holds,
@@ -235,15 +222,16 @@ def self_tuning(plant: KnownPlant, runs: int, seed: int) -> Agent:
         **plant.step_test,
         **plant.limits,
     )
+    return controller, plant.arguments
 
 
-def mpc(plant: KnownPlant, runs: int, seed: int) -> Agent:
+def mpc(plant: KnownPlant, runs: int, seed: int) -> Made:
     """Return model predictive control, which knows everything except the future."""
-    return PredictiveController(plant.parameters, runs, seed)
+    return PredictiveController(plant.parameters, runs, seed), plant.arguments
 
 
-def ppo(plant: KnownPlant, runs: int, seed: int, training: str) -> tuple[Agent, Any]:
-    """Return a policy that was trained by PPO, and the arguments of its environment.
+def ppo(plant: KnownPlant, runs: int, seed: int, training: str) -> Made:
+    """Return a policy that was trained by PPO, which observes and acts as in its training.
 
     `training` is the file of the network. If a dead zone was compensated in the training, the
     dead zone of `plant` is compensated instead, unless that is a range.
@@ -252,7 +240,7 @@ def ppo(plant: KnownPlant, runs: int, seed: int, training: str) -> tuple[Agent, 
     interface = network.interface
     if network.compensated_dead_zone and "dead_zone" not in plant.parameters.ranges:
         interface["compensated_dead_zone"] = plant.dead_zone
-    return network, interface
+    return network, {**plant.arguments, **interface}
 
 
 def _trained(pattern: str) -> list[str]:
