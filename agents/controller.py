@@ -219,3 +219,16 @@ class ModelBasedController(Controller):
         self._check(positive, "time_constant", "sampling_interval")
         self._check(not_negative, "delay", "dead_zone")
         self._edge = self.dead_zone
+
+    def check_environment(self, parameters: Parameters, n: int) -> None:
+        """Raise a ValueError if the controller does not fit the plants of an environment.
+
+        The arguments are described in `Controller.check_environment`. In addition to the checks
+        of `Controller`, the environment must have the sampling interval of the controller.
+        """
+        super().check_environment(parameters, n)
+        if parameters.sampling_interval != self.sampling_interval:
+            raise ValueError(
+                f"policy must have the sampling_interval of env, "
+                f"{parameters.sampling_interval} s, got {self.sampling_interval} s"
+            )

@@ -111,6 +111,8 @@ MISFITS = [  # and the message of the error
     )),
     (SelfTuningController(**STEP_TEST, error_index=0), {"setpoint_window": 0}, 5,
      "newest setpoint as element 0"),
+    (SmithPredictor(**TUNED), {"sampling_interval": 1.0}, 1,
+     "sampling_interval of env, 1.0 s, got 8.0 s"),
     (DirectNNController(num_envs=2), {}, 3, "num_envs=3, one loop per episode"),
     (PPO, PPO.interface | {"output_window": 3}, 5, "with which the policy was trained"),
     (PPO, PPO.interface | {"max_move": 0.4}, 5, "with which the policy was trained"),
