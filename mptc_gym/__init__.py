@@ -7,7 +7,8 @@
 Importing this package registers the ids `MiddlePoint-v0`, `MiddlePointDeadZone7-v0`,
 `MiddlePointNoisy-v0`, `MiddlePointDisturbed-v0`, `MiddlePointFouling-v0`,
 `MiddlePointRandomised-v0` and `MiddlePointHard-v0`. `PRESETS` holds the arguments of the
-registered environments. `evaluate` scores a policy.
+registered environments. `FOR_LEARNING` holds arguments for reinforcement learning. `evaluate`
+scores a policy.
 """
 
 import gymnasium
@@ -15,11 +16,12 @@ import gymnasium
 from mptc_gym.env import MiddlePointEnv
 from mptc_gym.evaluation import Evaluation, evaluate
 from mptc_gym.plant.parameters import EPISODE_STEPS, Parameters
-from mptc_gym.presets import IDS, PRESETS
+from mptc_gym.presets import FOR_LEARNING, IDS, PRESETS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
 __version__ = "0.7.0"
 __all__ = [
+    "FOR_LEARNING",
     "IDS",
     "PRESETS",
     "Evaluation",

@@ -49,3 +49,18 @@ IDS: Final[dict[str, str]] = {
     name: f"MiddlePoint{name.title().replace('-', '')}-v0" for name in PRESETS
 } | {"paper": "MiddlePoint-v0"}
 """The id of each preset, by name of the preset, as in `gymnasium.make(IDS["noisy"])`."""
+
+FOR_LEARNING: Final[dict[str, Any]] = {
+    "action": "change",
+    "compensated_dead_zone": 5.0,
+    "action_window": 20,
+    "setpoint": "random",
+    "reward": "absolute",
+}
+"""Arguments of the environment with which policies learn quickly, as `**FOR_LEARNING`.
+
+An action changes the flow, and the commands skip the dead zone of the paper's valve, so that
+each action of an exploring policy has an effect. An observation holds the latest 20 actions,
+more than the delay of the paper's plant in samples. The set points are random, and the reward
+is minus the magnitude of the error, in units of `error_scale`.
+"""

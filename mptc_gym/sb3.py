@@ -1,7 +1,6 @@
 """Train and score models of Stable-Baselines3 with many plants at once.
 
-    plants = make_vec_env("MiddlePoint-v0", 64, seed=0, action="change",
-                          compensated_dead_zone=5.0, action_window=20, setpoint="random")
+    plants = make_vec_env("MiddlePoint-v0", 64, seed=0, **FOR_LEARNING)
     model = PPO("MlpPolicy", plants, n_steps=64).learn(200_000, ScoreCallback(folder="best"))
 
 Requires `pip install "mptc_gym[sb3]"`.

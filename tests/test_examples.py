@@ -20,7 +20,7 @@ from agents import PolicyNetwork
 from agents.networks import PRETRAINED
 from benchmarks.examples import film, fit_plant, recurrent
 from benchmarks.lib.seeds import SEEDS
-from mptc_gym import MiddlePointEnv, evaluate
+from mptc_gym import FOR_LEARNING, MiddlePointEnv, evaluate
 from tests.conftest import ROOT, run
 
 
@@ -63,13 +63,12 @@ def test_ppo_runs_as_one_file_of_its_own(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["page", "--steps", "1"])
     monkeypatch.chdir(tmp_path)
     example = str(ROOT / "benchmarks/examples/sb3.py")
-    namespace = runpy.run_path(example, run_name="__main__")
-    printed = capsys.readouterr().out
-    line = re.search(r"MiddlePointNoisy-v0: mean error ([\d.]+)", printed)
-    plants = mptc_gym.sb3.make_vec_env("MiddlePoint-v0", 8, **namespace["PLANTS"])
-    model = PPO.load("ppo.zip", env=plants, device="cpu")
-    noisy = evaluate(model, "MiddlePointNoisy-v0")
-    assert f"{noisy.mean_error:.3f}" == line[1]
+    runpy.run_path(example, run_name="__main__")
+    *_, paper, noisy = capsys.readouterr().out.splitlines()
+    plants = mptc_gym.sb3.make_vec_env("MiddlePoint-v0", 8, **FOR_LEARNING, max_move=1.0)
+    model = PPO.load("best/best_model.zip", env=plants, device="cpu")
+    assert paper == str(evaluate(model))
+    assert noisy == str(evaluate(model, "MiddlePointNoisy-v0"))
 
 
 def test_the_notebook_runs_and_shows_what_it_showed(capsys, monkeypatch):

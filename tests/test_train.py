@@ -1,8 +1,9 @@
 """Training by PPO: what groups of plants share, and what a file of a policy holds."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,19 +14,19 @@ from agents import PolicyNetwork
 from agents.networks import PRETRAINED
 from benchmarks.controllers.own import own_controllers
 from benchmarks.controllers.roster import ROSTER
-from benchmarks.examples import sb3
 from benchmarks.loop.runs import make_plants
 from benchmarks.train import __main__ as program
-from benchmarks.train import ppo
+from benchmarks.train import learning, ppo, recipe
 from tests.conftest import ROOT
 
 RECIPE = replace(
-    ppo.RECIPES["ppo"],
+    recipe.RECIPES["ppo"],
     plants=(
-        ppo.TrainingPlants(8, {"setpoint": "random"}),
-        ppo.TrainingPlants(16, {"setpoint": "random", "noise_variance": 0.5}),
+        recipe.TrainingPlants(8, {"setpoint": "random"}),
+        recipe.TrainingPlants(16, {"setpoint": "random", "noise_variance": 0.5}),
     ),
     cases={"short": {"max_episode_steps": 20}},
+    scored_on={"max_episode_steps": 20},
     hidden=(8,),
     memory=40,
     steps=512,
@@ -35,26 +36,43 @@ RECIPE = replace(
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     for name, value in {"n_steps": 32, "batch_size": 64}.items():
-        monkeypatch.setitem(sb3.SETTINGS, name, value)
+        monkeypatch.setitem(ppo.SETTINGS, name, value)
 
 
 def test_the_command_trains_what_is_missing_for_a_plant_on_which_compare_runs_it(
-    tmp_path, capsys, monkeypatch
+    tmp_path, capsys, monkeypatch, refused
 ):
-    few = replace(ppo.RECIPES["ppo"], plants=(ppo.TrainingPlants(8, {}),) * 2)
-    monkeypatch.setitem(ppo.RECIPES, "ppo", few)
+    few = replace(recipe.RECIPES["ppo"], plants=(recipe.TrainingPlants(8, {}),) * 2)
+    monkeypatch.setitem(recipe.RECIPES, "ppo", few)
+    monkeypatch.setattr(learning, "EPISODES", 2)
+    monkeypatch.setattr(learning, "COMPARED", ["pi-simc", "nn"])
     words = f"ppo --steps 8 --jobs 1 --set b=[0.0456,0.00404] --set u_max=12 --out {tmp_path}"
     files = [tmp_path / f"ppo-plant-{seed}.npz" for seed in (10_000, 10_001)]
     assert program.main([*words.split(), "--networks", "1"]) == 0
+    first_provenance = (tmp_path / "provenance.json").read_text()
     written = files[0].stat().st_mtime_ns
     assert program.main([*words.split(), "--networks", "2"]) == 0
     assert files[0].stat().st_mtime_ns == written
+    assert (tmp_path / "provenance.json").read_text() == first_provenance
     assert {"10000", "10001"} <= set(capsys.readouterr().out.split())
+    # Networks of other plants or lengths need another folder, which stays as it is.
+    for other, text in [("--set u_max=11", "with plant {"), ("--steps 9", "with steps 8 and")]:
+        assert text in refused(program.main, [*words.split(), *other.split()])
+    assert (tmp_path / "provenance.json").read_text() == first_provenance
     (spec,) = own_controllers([f"mine={file}" for file in files]).values()
     assert spec.direction == 1
     rising = {"b": [0.0456, 0.00404], "u_max": 12.0}
     first, second = (member.run(rising, 20, 1, 0).command for member in spec.members())
     assert (first != second).any()
+    table = pd.read_csv(tmp_path / "learning.csv").set_index("policy")
+    assert [*table.index] == ["seed 10000"] * 2 + ["seed 10001"] * 2 + ["pi-simc", "nn"]
+    assert [*table["samples"].fillna(-1)] == [0, 512] * 2 + [-1, -1]
+    assert table["score"].isna().all()  # as the reference error is unknown
+    network = PolicyNetwork.load(files[1], u_max=12.0)
+    arguments = {**network.interface, **recipe.for_plant(rising).scored_on}
+    result = learning.score(network, arguments)
+    assert table["mean_error"].iloc[3] == result["mean_error"]
+    assert plt.imread(tmp_path / "learning.png").std() > 0.0
 
 
 def weights(network):
@@ -83,22 +101,22 @@ class TestPPO:
         assert len(set(rewards[:, 0])) == 3
 
     def test_plants_of_both_kinds_are_stepped_as_in_batches_of_their_own(self):
-        ending = [ppo.TrainingPlants(n, {"max_episode_steps": 2}) for n in (8, 16)]
-        plants, alone = (ppo.Plants(replace(RECIPE, plants=ending)) for _ in range(2))
+        noisy = {"max_episode_steps": 2, "noise_variance": 0.5}
+        ending = [recipe.TrainingPlants(n, noisy) for n in (8, 16)]
+        plants, alone = (ppo.TrainingVecEnv(replace(RECIPE, plants=ending)) for _ in range(2))
         actions = np.linspace(-1.0, 1.0, 24)[:, np.newaxis]
+        seeds = plants.seed(3)
         plants.reset()
         plants.step(actions)
         inputs, rewards, _, infos = plants.step(actions)
-        for batch, rows in zip(alone.batches, (slice(8), slice(8, 24)), strict=True):
-            batch.reset()
+        for batch, rows in zip(alone.batch.batches, (slice(8), slice(8, 24)), strict=True):
+            batch.reset(seed=seeds[rows])
             batch.step(actions[rows])
-            observations, rewards_alone, _, infos_alone = batch.step(actions[rows])
-            last, last_alone = (
-                np.array([info["terminal_observation"] for info in both])
-                for both in (infos[rows], infos_alone)
-            )
-            assert np.array_equal(rewards[rows], rewards_alone)
-            matrix = ppo.features(RECIPE).T
+            observations, rewards_alone, _, _, infos_alone = batch.step(actions[rows])
+            last = np.array([info["terminal_observation"] for info in infos[rows]])
+            last_alone = np.stack(infos_alone["final_obs"])
+            np.testing.assert_allclose(rewards[rows], rewards_alone, rtol=1e-6)
+            matrix = recipe.inputs(RECIPE).T
             np.testing.assert_allclose(inputs[rows], observations @ matrix, atol=1e-5)
             np.testing.assert_allclose(last, last_alone @ matrix, atol=1e-5)
 
@@ -106,7 +124,7 @@ class TestPPO:
         model = ppo.begin(RECIPE, 0)
         spaces = model.observation_space, model.action_space
         buffer, plain = (
-            kind(3, *spaces, gamma=0.9, n_envs=16) for kind in (sb3.GroupBuffer, RolloutBuffer)
+            kind(3, *spaces, gamma=0.9, n_envs=16) for kind in (ppo.GroupBuffer, RolloutBuffer)
         )
         rewards = np.random.default_rng(0).normal(size=(3, 16)).astype(np.float32)
         common = np.repeat([[1.0, 5.0]], ppo.GROUP, axis=1).astype(np.float32)
@@ -123,63 +141,65 @@ class TestPPO:
 
 class TestExport:
     def test_changes_by_hand(self):
-        window = torch.tensor([[8.0, 6.0, 5.0, 1.0, 4.0, 4.0, 0.0]])  # newest first
+        window = [8.0, 6.0, 5.0, 1.0, 4.0, 4.0, 0.0]  # newest first
         # Means of 8, of 6, of 5 and 1, and of the rest.
-        assert sb3.changes(window, 2)[0].tolist() == pytest.approx([2.0, 3.0, 3.0 - 8.0 / 3.0])
+        changes = recipe.changes(7, short_stretches=2) @ window
+        assert changes.tolist() == pytest.approx([2.0, 3.0, 3.0 - 8.0 / 3.0])
 
     @pytest.mark.parametrize(
-        ("recipe", "scale"),  # of the action: with limits that matter
+        ("trained", "scale"),  # of the action: with limits that matter
         [(RECIPE, 300.0), (replace(RECIPE, levels=True, hidden=(), dead_zone=0.0), 1.0)],
     )
-    def test_without_torch_it_acts_as_in_training(self, recipe, scale):
-        model = ppo.begin(recipe, 5)
+    def test_without_torch_it_acts_as_in_training(self, trained, scale):
+        model = ppo.begin(trained, 5)
         with torch.no_grad():
             model.policy.action_net.weight.mul_(scale)
-        network = ppo.export(model, recipe)
+        network = ppo.export(model, trained)
         plants = make_plants(3, 80, setpoint=5.0, noise_variance=0.5, **network.interface)
         observations, _ = plants.reset(seed=1)
         moves = []
         for _ in range(80):
-            inputs = observations @ ppo.features(recipe).T
+            inputs = observations @ recipe.inputs(trained).T
             moves.append(model.predict(inputs, deterministic=True)[0])
             np.testing.assert_allclose(network.act(observations), moves[-1], atol=1e-3)
             observations, *_ = plants.step(moves[-1])
         assert (np.abs(moves).max() == 1.0) == (scale > 1.0)
 
 
-@pytest.mark.parametrize("name", ppo.RECIPES)
+@pytest.mark.parametrize("name", recipe.RECIPES)
 def test_those_of_the_project_are_of_the_recipes_and_the_search_is_that_of_its_log(name):
     log = pd.read_csv(ROOT / "benchmarks/published/ppo_trials.csv")
     trials = log[log.policy == name]
     samples, minutes = trials.samples.sum() / 1e6, trials.cpu_seconds.sum() / 60
     said = f"{len(trials)} trials: {samples:.0f} M samples, {minutes:.0f} min"
     assert ROSTER[name].searched.endswith(said)
-    recipe = ppo.RECIPES[name]
-    settings = json.loads(json.dumps(asdict(recipe)))
-    assert settings.pop("plant") == {}
+    of_name = recipe.RECIPES[name]
+    settings = json.loads(json.dumps(program.flattened(ppo.settings_of(of_name))))
     files = {seed: f"{name}-{seed}.npz" for seed in range(program.SEED, program.SEED + 5)}
     assert ROSTER[name].trainings == [*files.values()]
     for seed, file in files.items():
         network = PolicyNetwork.load(PRETRAINED / file)
         assert network.provenance["seed"] == seed
-        assert settings.items() <= network.provenance["recipe"].items()
+        written = program.flattened(network.provenance)
+        for key in settings.keys() - ppo.SETTINGS.keys():  # which this module makes smaller
+            assert settings[key] == written[key]
         count = sum(W.size for W, _ in network.layers)
         assert f"{count:,} weights" in ROSTER[name].searched
-        assert f": {recipe.steps / 1e6:g} M samples a policy" in ROSTER[name].searched
+        assert f": {of_name.steps / 1e6:g} M samples a policy" in ROSTER[name].searched
 
 
 def test_the_recipe_for_another_plant_is_that_of_the_paper_plant_scaled():
     plant = {"b": [0.0456, 0.00404], "setpoint_amplitude": 10.0, "dead_zone": 2.0}
-    recipe, paper = ppo.for_plant(plant), ppo.for_plant({})
-    assert [count for count, _ in recipe.plants] == [152, 360]
-    for _, arguments in recipe.plants:
+    scaled, paper = recipe.for_plant(plant), recipe.for_plant({})
+    assert [count for count, _ in scaled.plants] == [152, 360]
+    for _, arguments in scaled.plants:
         assert arguments["b"] == plant["b"]
         assert (arguments["setpoint"], arguments["setpoint_amplitude"]) == ("random", 12.0)
-    assert recipe.dead_zone == 2.0
+    assert scaled.dead_zone == 2.0
     # Of twice as large temperatures and the same flows, the inputs are the same.
-    observation = np.random.default_rng(0).normal(size=sum(recipe.windows.values()))
-    scaled = np.where(np.arange(observation.size) < 4 + recipe.memory, 2.0, 1.0)
+    observation = np.random.default_rng(0).normal(size=sum(paper.windows.values()))
+    factors = np.where(np.arange(observation.size) < 4 + paper.memory, 2.0, 1.0)
     np.testing.assert_allclose(
-        ppo.features(recipe) @ (scaled * observation), ppo.features(paper) @ observation
+        recipe.inputs(scaled) @ (factors * observation), recipe.inputs(paper) @ observation
     )
-    assert paper.plants == ppo.RECIPES["ppo"].plants
+    assert paper.plants == recipe.RECIPES["ppo"].plants

@@ -26,6 +26,8 @@ def new_folder(
 ) -> Path:
     """Create a folder for the results of a command, and write `provenance` to it.
 
+    A folder of an earlier run keeps the provenance of that run.
+
     Two runs of a command at the same time get two folders, since a command calls this function
     before it computes its results.
 
@@ -54,6 +56,8 @@ def new_folder(
         is_continued = goes_on and (folder / PROVENANCE_FILE).exists()
         if folder.is_file() or (any(folder.glob("*")) and not is_continued):
             raise CommandError(f"--out must be a new or empty folder, got {folder}")
+        if is_continued:
+            return folder
         folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / PROVENANCE_FILE, provenance)
     return folder

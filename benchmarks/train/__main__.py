@@ -1,9 +1,11 @@
 """Train policies by PPO: `python -m benchmarks.train --help`."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 from agents import PolicyNetwork
 from benchmarks.lib.command import CommandError, Count, Folder, Parameter, command, options
@@ -19,9 +21,10 @@ NETWORKS = "ppo", "ppo-hard"
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Train policies by PPO on simulated plants.
+    """Train policies by PPO on simulated plants, and draw their scores over the samples.
 
-    If --out names the folder of an earlier run, only networks that are missing are trained.
+    If --out names the folder of an earlier run of the same training, only networks that are
+    missing are trained.
     """
 
     network: Annotated[str | None, Parameter(choices=NETWORKS)] = field(
@@ -40,26 +43,29 @@ class Options:
 
 
 def work(options: Options) -> None:
-    """Train the networks that are missing in the folder, and print a table of all of them.
+    """Train the networks that are missing in the folder, and show the results of all of them.
 
-    A `CommandError` is raised if the options name no network, or a plant for a network other
-    than "ppo".
+    A `CommandError` is raised if the options name no network, a plant for a network other than
+    "ppo", or a folder with networks of another plant or other settings.
     """
-    from benchmarks.train import ppo
+    from benchmarks.train import learning, ppo
+    from benchmarks.train.recipe import RECIPES, for_plant
 
     name = options.network
     if name is None:
         raise CommandError(f"name the network to train: {', '.join(NETWORKS)}")
-    recipe = ppo.RECIPES[name]
+    recipe = RECIPES[name]
     stem = name  # beginning of the names of the files
     if options.plant.name:
         if name != "ppo":
             raise CommandError(f"--plant, --preset and --set are for ppo, not for {name}")
-        recipe = ppo.for_plant(options.plant.arguments())
+        recipe = for_plant(options.plant.arguments())
         stem = "ppo-plant"
     if options.steps:
         recipe = replace(recipe, steps=options.steps)
     seeds = list(range(SEED, SEED + options.networks))
+    if options.out:
+        check_folder(options.out, ppo.settings_of(recipe))
     folder = new_folder(options.out, f"train-{stem}", provenance_of(seeds=seeds), goes_on=True)
     files = {seed: folder / f"{stem}-{seed}.npz" for seed in seeds}
     tasks = {
@@ -75,6 +81,35 @@ def work(options: Options) -> None:
     print(f"The networks are in {folder}/")
     if finished.error:
         raise finished.error
+    controllers = {
+        name: partial(learning.score_controller, name, recipe) for name in learning.COMPARED
+    }
+    scored = options.fan_out.run(controllers, "other controllers")
+    learning.write(networks, scored.results, folder)
+    if scored.error:
+        raise scored.error
+
+
+def check_folder(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Raise a CommandError if a folder has a network that other settings have given.
+
+    `settings` are those of the training, as `ppo.settings_of` returns them.
+    """
+    # A file has the settings as JSON, with lists in place of tuples.
+    expected = flattened(json.loads(json.dumps(settings)))
+    for file in folder.glob("*.npz"):
+        present = flattened(PolicyNetwork.load(file).provenance)
+        for name, value in expected.items():
+            if present[name] != value:
+                raise CommandError(
+                    f"--out: {file} is of another training run, with {name} "
+                    f"{json.dumps(present[name])} and not {json.dumps(value)}"
+                )
+
+
+def flattened(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the plant and each setting of the recipe by name."""
+    return {"plant": settings["plant"], **settings["recipe"]}
 
 
 def show_validation(networks: Mapping[int, PolicyNetwork]) -> None:
