@@ -45,7 +45,7 @@ def test_the_command_trains_what_is_missing_for_a_plant_on_which_compare_runs_it
     few = replace(recipe.RECIPES["ppo"], plants=(recipe.TrainingPlants(8, {}),) * 2)
     monkeypatch.setitem(recipe.RECIPES, "ppo", few)
     monkeypatch.setattr(learning, "EPISODES", 2)
-    monkeypatch.setattr(learning, "COMPARED", ["pi-simc", "nn"])
+    monkeypatch.setattr(learning, "COMPARED", {"pi-simc": "-", "nn": ":"})
     words = f"ppo --steps 8 --jobs 1 --set b=[0.0456,0.00404] --set u_max=12 --out {tmp_path}"
     files = [tmp_path / f"ppo-plant-{seed}.npz" for seed in (10_000, 10_001)]
     assert program.main([*words.split(), "--networks", "1"]) == 0

@@ -108,8 +108,8 @@ def check_folder(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def flattened(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the plant and each setting of the recipe by name."""
-    return {"plant": settings["plant"], **settings["recipe"]}
+    """Return the plant, which the oldest files do not name, and the recipe's settings by name."""
+    return {"plant": settings.get("plant", {}), **settings["recipe"]}
 
 
 def show_validation(networks: Mapping[int, PolicyNetwork]) -> None:

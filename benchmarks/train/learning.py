@@ -10,15 +10,15 @@ from typing import Any
 import pandas as pd
 
 from agents import PolicyNetwork
-from benchmarks.controllers.roster import ROSTER
+from benchmarks.controllers.roster import GROUPS, ROSTER
 from benchmarks.lib.pictures import open_picture
 from benchmarks.train.recipe import Recipe
 from mptc_gym import evaluate
 from mptc_gym.evaluation import VALIDATION_SEED
 
 EPISODES = 20  # validation episodes of each score
-# The controllers, by their names in the roster, with which policies are compared.
-COMPARED = "mpc", "self-tuning", "pi-simc", "nn"
+# Matplotlib's line style for each controller with which policies are compared.
+COMPARED = {"mpc": "-", "self-tuning": "--", "pi-simc": "-.", "nn": ":"}
 LABELS = {
     "score": "score on validation episodes",
     "mean_error": "mean error on validation episodes (°C)",
@@ -91,12 +91,14 @@ def draw(table: pd.DataFrame, column: str, path: Path) -> None:
     )
     with open_picture(path, 4.0, title) as figure:
         axes = figure.subplots()
-        axes.plot(curves, color="#E69F00", linewidth=0.7, alpha=0.7)
-        axes.plot(median, color="#E69F00", linewidth=2.0, label="PPO, median")
+        colour = GROUPS[ROSTER["ppo"].group].colour
+        axes.plot(curves, color=colour, linewidth=0.7, alpha=0.6)
+        axes.plot(median, color=colour, linewidth=2.0, label="PPO, median")
+        # Two controllers of a group have the same colour, but no two have the same dashes.
         for name, value in lines.items():
             spec = ROSTER[str(name)]
-            colour, _ = spec.look
-            axes.axhline(value, color=colour, linestyle="--", label=spec.label)
+            colour = GROUPS[spec.group].colour
+            axes.axhline(value, color=colour, linestyle=COMPARED[spec.name], label=spec.label)
         # What is far worse than the other controllers, as before the training, is not shown.
         shown = [*lines, median.iloc[-1]]
         margin = 0.2 * (max(shown) - min(shown))
