@@ -108,7 +108,7 @@ def check_folder(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def flattened(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the plant, which the oldest files do not name, and the recipe's settings by name."""
+    """Return the plant, which the oldest files do not name, and each setting by name."""
     return {"plant": settings.get("plant", {}), **settings["recipe"]}
 
 
