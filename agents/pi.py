@@ -36,10 +36,10 @@ class PIController(Controller):
     ki
         Integral gain Ki, t/h per degC and sample.
     anti_windup
-        Whether to stop the sum of the errors while the command is beyond a flow limit and the
-        error would move the command further beyond this limit (conditional integration; Astrom
-        and Hagglund, "PID Controllers", 2nd edition, 1995, section 3.5). The controller in the
-        paper has no anti-windup.
+        Whether to stop the sum of the errors where the command reaches a flow limit, as long as
+        the error would move the command further beyond this limit (conditional integration;
+        Astrom and Hagglund, "PID Controllers", 2nd edition, 1995, section 3.5). The controller
+        in the paper has no anti-windup.
     error_index
         Index of the error e(k), degC, in an observation.
     """
@@ -136,12 +136,13 @@ class PIController(Controller):
         error: Array = rows[:, self.error_index]
         total = self._sum + error
         command = -self.kp * error - self.ki * total  # Section 5
-        if self.anti_windup:
+        if self.anti_windup and self.ki:
             change = -self.ki * error  # of the command by the present error
-            is_above = command > self.u_max
-            is_below = command < self.u_min
-            drives_outward = is_above & (change > 0) | is_below & (change < 0)
-            total = np.where(drives_outward, self._sum, total)
-            command = -self.kp * error - self.ki * total
+            excess = command - np.clip(command, self.u_min, self.u_max)
+            # The part of the change that leads beyond a limit. It is the whole change if the
+            # command was beyond the limit before, because of the proportional part.
+            needless = np.clip(excess, np.minimum(change, 0.0), np.maximum(change, 0.0))
+            total = total + needless / self.ki
+            command = command - needless
         self._sum = total
         return command

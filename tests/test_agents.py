@@ -58,11 +58,21 @@ def policy(**arguments):
     [
         # u = -2 e - 0.5 (sum of e): -2 - 0.5, 4 + 0.5, -6 - 1; as printed, beyond the limits
         ({"kp": 2.0, "ki": 0.5, "u_min": -4.0, "u_max": 8.0}, (1, -2, 3), (-2.5, 4.5, -7)),
-        # Limits +-4. e = 3: -3 - 1.5 = -4.5 is beyond the limit: the sum stays 0.
-        # e = 1: -1 - 0.5; e = -3: 3 + 0.5 (2) = 4 is not beyond it; e = -1: 1 + 0.5 (3).
+        # Limits +-4. e = 3: -3 - 1.5 = -4.5 is beyond the limit, which a sum of 2 reaches.
+        # e = 1: -1 - 0.5 (3); e = -3: 3 - 0.5 (0); e = -1: 1 + 0.5 (1).
         (
             {"kp": 1.0, "ki": 0.5, "anti_windup": True, "u_min": -4, "u_max": 4},
-            (3, 1, -3, -1), (-3.0, -1.5, 4.0, 2.5),
+            (3, 1, -3, -1), (-4.0, -2.5, 3.0, 1.5),
+        ),
+        # A proportional part of 6 is beyond the limit: the sum stays as it was.
+        (
+            {"kp": 1.0, "ki": 0.5, "anti_windup": True, "u_min": -4, "u_max": 4},
+            (-1, -6, -1), (1.5, 6.5, 2.0),
+        ),
+        # An error that stays: up to the limit of a heater, and down to it.
+        (
+            {"kp": -1.0, "ki": -0.8, "anti_windup": True, "u_min": 0, "u_max": 10},
+            (3, 3, 3, 3, -3, -3, -3, -3), (5.4, 7.8, 10.0, 10.0, 1.6, 0.0, 0.0, 0.0),
         ),
         # At least 2 t/h: e = -1 gives 1 + 0.5, which is below, then more: not held.
         (
