@@ -112,6 +112,34 @@ def test_sensitivity_by_hand():
     assert loop_with_integrator(0.61, 0).sensitivity() == pytest.approx(2.0 / (2.0 - 0.61))
 
 
+@pytest.mark.parametrize("damping", [0.02, 0.1, 1.0])
+@pytest.mark.parametrize(("frequency", "delay"), [(0.02, 200), (0.02, 3), (1.0, 0), (0.2, 20)])
+def test_sensitivity_is_that_of_a_dense_grid(damping, frequency, delay):
+    poles = np.exp(frequency * np.array([1j, -1j]) * np.emath.sqrt(1.0 - damping**2))
+    a = np.real(np.poly(poles * np.exp(-damping * frequency)))
+    plant = nominal(Parameters(a=a.tolist(), b=[0.6 * a.sum(), 0.4 * a.sum()], delay=delay))
+    for kp in (-0.01, -0.1, -0.5):
+        loop = LinearLoop.of(PIController(kp, 0.1 * kp / (delay + 1.0 / frequency)), plant)
+        if loop.largest_pole() >= 1.0:
+            assert loop.sensitivity() == np.inf
+            continue
+        polynomials = loop.denominator, loop.characteristic
+        values = [signal.freqz(polynomial, worN=200_000)[1] for polynomial in polynomials]
+        most = np.abs(values[0] / values[1]).max()
+        assert loop.sensitivity() == pytest.approx(most, rel=0.02)
+
+
+@pytest.mark.parametrize("time_constant", [40.0, 4e3, 4e4])
+def test_slow_loops_are_as_stable_as_fast_ones(time_constant):
+    # The closed loop of SIMC is as fast as the delay, which is in proportion.
+    delay = round(time_constant / 4)
+    pole = np.exp(-1.0 / time_constant)
+    plant = nominal(Parameters(a=[1.0, -pole], b=[1.0 - pole], delay=delay - 1))
+    numbers = {"gain": 1.0, "time_constant": time_constant, "sampling_interval": 1.0}
+    controller = PIController.simc(**numbers, delay=delay)
+    assert LinearLoop.of(controller, plant).sensitivity() == pytest.approx(1.58, abs=0.03)
+
+
 def test_a_rule_is_slowed_down_until_its_sensitivity_is_the_target():
     plant = nominal(Parameters())
 

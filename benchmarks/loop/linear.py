@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.polynomial.polynomial import polyadd, polyval
+from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
 from mptc_gym import Parameters
@@ -34,10 +34,16 @@ EARLY_LEVEL, LATE_LEVEL = 0.283, 0.632
 # slower plant would be too long.
 SLOWEST_POLE = 1 - 1e-5
 REMAINING_TRANSIENT = 1e-5  # share of a transient that remains after a step test
-# Frequencies at which the sensitivity function is computed, rad per sample; pi is the highest
-# frequency of a sampled signal.
-FREQUENCIES = np.geomspace(1e-4, math.pi, 400)
-CIRCLE_POINTS = 1 << 14  # points on the unit circle for the count of unstable poles
+# Frequencies at which a loop is computed, rad per sample: those of a grid that is dense at low
+# frequencies, and `POINTS_PER_TURN` in each turn of z^-n, where n is the order of the loop. The
+# grid is refined where the characteristic polynomial turns around 0 by more than
+# `LARGEST_TURN`, rad, from one frequency to the next: between two other frequencies, the
+# polynomial comes closer to 0 than at both of them by 2 % at most.
+LOW_FREQUENCIES = np.append(np.geomspace(1e-7, 1e-4, 100), np.geomspace(1e-4, math.pi, 400))
+POINTS_PER_TURN = 8
+LARGEST_TURN = 0.3
+# Largest number of times that an interval of the grid is halved, if a pole lies on the circle.
+MOST_REFINEMENTS = 40
 TIME_CONSTANTS_TRIED = 24  # number of time constants before the bisection
 PRECISION = 1e-5  # relative precision of the time constant that `time_constant_for` returns
 
@@ -345,29 +351,62 @@ class LinearLoop:
         return float(np.abs(np.roots(self.characteristic)).max())
 
     def is_stable(self) -> bool:
-        """Return whether the loop is stable: whether all poles have magnitudes below 1.
-
-        While z^-1 goes around the unit circle once, the characteristic polynomial goes around 0
-        once for each pole outside the unit circle (argument principle).
-        """
-        # Values of the characteristic polynomial at equidistant points on the unit circle.
-        values = np.fft.fft(self.characteristic, CIRCLE_POINTS)
-        if not values.all():  # A pole lies on the circle.
-            return False
-        turns = np.angle(np.roll(values, -1) / values).sum() / (2.0 * math.pi)
-        return bool(round(turns) == 0)
+        """Return whether the loop is stable: whether all poles have magnitudes below 1."""
+        return math.isfinite(self.sensitivity())
 
     def sensitivity(self) -> float:
         """Return the maximum sensitivity Ms of the loop; infinite for an unstable loop.
 
-        Ms is the largest magnitude of the sensitivity function 1 / (1 + L) at the frequencies
-        in `FREQUENCIES`, where L is the transfer function from the error to the temperature.
+        Ms is the largest magnitude of the sensitivity function 1 / (1 + L) over all
+        frequencies, where L is the transfer function from the error to the temperature. While
+        z^-1 goes around the upper half of the unit circle, the characteristic polynomial turns
+        around 0 by half a turn for each pole outside the unit circle (argument principle).
         """
-        if not self.is_stable():
+        frequencies, characteristic = self._on_refined_grid()
+        if not characteristic.all():  # A pole lies on the circle.
             return math.inf
-        inverse_z = np.exp(-1j * FREQUENCIES)
-        characteristic = polyval(inverse_z, self.characteristic)
-        return float(np.abs(polyval(inverse_z, self.denominator) / characteristic).max())
+        half_turns = _turns(characteristic).sum() / math.pi
+        if round(half_turns) != 0:
+            return math.inf
+        denominator = _values_on_circle(self.denominator, frequencies)
+        return float(np.abs(denominator / characteristic).max())
+
+    def _on_refined_grid(self) -> tuple[Array, NDArray[np.complex128]]:
+        """Return frequencies from 0 to pi, rad per sample, and the characteristic polynomial.
+
+        From each frequency to the next, the characteristic polynomial turns around 0 by at most
+        `LARGEST_TURN`, unless a pole lies on the unit circle.
+        """
+        points = POINTS_PER_TURN * len(self.characteristic) // 2
+        grid = np.union1d(np.linspace(0.0, math.pi, points + 1), LOW_FREQUENCIES)
+        values = _values_on_circle(self.characteristic, grid)
+        for _ in range(MOST_REFINEMENTS):
+            wide = np.flatnonzero(np.abs(_turns(values)) > LARGEST_TURN)
+            if len(wide) == 0:
+                break
+            middles = (grid[wide] + grid[wide + 1]) / 2.0
+            grid = np.insert(grid, wide + 1, middles)
+            new_values = _values_on_circle(self.characteristic, middles)
+            values = np.insert(values, wide + 1, new_values)
+        return grid, values
+
+
+def _turns(values: NDArray[np.complex128]) -> Array:
+    """Return the angles from each complex number to the next, rad, from -pi to pi."""
+    return np.asarray(np.angle(values[1:] * values[:-1].conj()))
+
+
+def _values_on_circle(polynomial: Array, frequencies: Array) -> NDArray[np.complex128]:
+    """Return the values of a polynomial in z^-1 at z = exp(i frequency), in rad per sample.
+
+    `polynomial` has the coefficients of z^0, z^-1 and so on, most of which are 0 if the delay
+    is long.
+    """
+    powers = np.flatnonzero(polynomial)
+    values: NDArray[np.complex128] = (
+        np.exp(-1j * np.outer(frequencies, powers)) @ polynomial[powers]
+    )
+    return values
 
 
 def time_constant_for(
