@@ -91,8 +91,9 @@ class RandomSignal(ABC):
 
     def ahead(self) -> list[float]:
         """Return the signal of a single plant at the samples of a block, degC, in a list."""
-        self._fill(ONLY_PLANT, 0)
-        values: list[float] = self._block[:, 0].tolist()
+        generators = [self._streams[0].generator]
+        block = self._generate(ONLY_PLANT, generators, len(self._block))
+        values: list[float] = block[0].tolist()
         return values
 
     def _begin(self, plants: Indices, streams: Sequence[EpisodeStream]) -> None:
@@ -245,6 +246,7 @@ class RepeatedSetPoint:
     """
 
     def __init__(self, levels: SetPointLevels, num_envs: int) -> None:
+        self._sequence = levels
         self._levels = np.array(levels.values)
         self._ends = np.cumsum(levels.lengths)  # samples of a period at which the levels end
         # Times in samples since the plants were created: the present time, the starts of the
@@ -273,9 +275,19 @@ class RepeatedSetPoint:
 
     def ahead(self) -> list[float]:
         """Return the set points of a single plant at the next 600 samples, degC, in a list."""
-        k = self._clock - self._starts + np.arange(1, SAMPLES_AT_A_TIME + 1)
+        # Level by level in Python, which is faster than `_at` for each sample.
+        values = self._sequence.values
+        lengths = self._sequence.lengths
+        k_in_period = (self._clock + 1 - self._starts.item()) % self._ends[-1].item()
+        place = int(np.searchsorted(self._ends, k_in_period, side="right"))
+        samples_left = self._ends[place].item() - k_in_period
+        setpoints: list[float] = []
+        while len(setpoints) < SAMPLES_AT_A_TIME:
+            missing = SAMPLES_AT_A_TIME - len(setpoints)
+            setpoints += [values[place]] * min(samples_left, missing)
+            place = (place + 1) % len(values)
+            samples_left = lengths[place]
         self._clock += SAMPLES_AT_A_TIME
-        setpoints: list[float] = self._at(k)[0].tolist()
         return setpoints
 
     def _at(self, k: NDArray[np.int64]) -> tuple[Values, int]:
@@ -405,10 +417,13 @@ class Disturbance(RandomSignal):
         rows = np.arange(len(plants))
         self._last_walks[plants] = walks[rows, changes]
         self._last_levels[plants] = levels[rows, changes]
-        # The load at samples from the latest change on, which was `ages` samples ago.
-        loads = np.repeat(levels + walks, LOAD_INTERVAL, axis=1)
-        firsts = (ages + 1).tolist()
-        return np.stack([row[i : i + samples] for row, i in zip(loads, firsts, strict=True)])
+        # The loads from the latest change on. It was `age` samples before the latest sample of
+        # the plant, so column `age` is that sample, and the next column the first new sample.
+        held = np.repeat(levels + walks, LOAD_INTERVAL, axis=1)
+        loads = np.empty((len(plants), samples))
+        for load, held_load, age in zip(loads, held, ages.tolist(), strict=True):
+            load[:] = held_load[age + 1 : age + 1 + samples]
+        return loads
 
     def _walks(self, plants: Indices, uniform: Values) -> Values:
         """Return the random walks of some plants, degC: the last ones, and after each change.
@@ -416,8 +431,10 @@ class Disturbance(RandomSignal):
         `uniform` holds random numbers from 0 to 1, one for each step of a random walk, shape
         (len(plants), number of changes of the load). The returned walks have one column more.
         """
-        steps = (2.0 * uniform - 1.0) * self._largest_walk_steps[plants, np.newaxis]
-        walks: Values = np.hstack((self._last_walks[plants, np.newaxis], steps)).cumsum(axis=1)
+        steps = np.empty((len(plants), uniform.shape[1] + 1))
+        steps[:, 0] = self._last_walks[plants]
+        steps[:, 1:] = (2.0 * uniform - 1.0) * self._largest_walk_steps[plants, np.newaxis]
+        walks: Values = steps.cumsum(axis=1)
         return walks
 
     def _levels(self, plants: Indices, jump_uniform: Values, level_uniform: Values) -> Values:
@@ -427,15 +444,18 @@ class Disturbance(RandomSignal):
         `level_uniform` random numbers from 0 to 1 that decide the new level, both of shape
         (len(plants), number of changes of the load). The returned levels have one column more.
         """
-        jumps = jump_uniform < self._jump_probabilities[plants, np.newaxis]
-        new_levels = (2.0 * level_uniform - 1.0) * self._amplitudes[plants, np.newaxis]
         # The level at a change is the level of the latest jump up to this change. Column 0 of
         # `candidates` is the last known level, which holds until the first jump.
-        candidates = np.hstack((self._last_levels[plants, np.newaxis], new_levels))
+        candidates = np.empty((len(plants), jump_uniform.shape[1] + 1))
+        candidates[:, 0] = self._last_levels[plants]
+        candidates[:, 1:] = (2.0 * level_uniform - 1.0) * self._amplitudes[plants, np.newaxis]
+        jumps = jump_uniform < self._jump_probabilities[plants, np.newaxis]
         columns_of_jumps = np.zeros(candidates.shape, np.intp)
-        columns_of_jumps[:, 1:] = np.where(jumps, np.arange(1, candidates.shape[1]), 0)
+        columns_of_jumps[:, 1:] = jumps * np.arange(1, candidates.shape[1])
         columns_of_latest_jumps = np.maximum.accumulate(columns_of_jumps, axis=1)
-        return np.take_along_axis(candidates, columns_of_latest_jumps, axis=1)
+        rows = np.arange(len(plants))[:, np.newaxis]
+        levels: Values = candidates[rows, columns_of_latest_jumps]
+        return levels
 
 
 class Signals(NamedTuple):
