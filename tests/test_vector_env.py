@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mptc_gym import PRESETS, MiddlePointVectorEnv
+from mptc_gym import PRESETS, MiddlePointEnv, MiddlePointVectorEnv
 from tests.conftest import MODES, NOISY, native_and_sync, random_actions, valid_arguments
 
 CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 5.0}
@@ -119,6 +119,23 @@ def test_it_equals_them_over_long_times_and_at_the_edge(mode, limit, steps, argu
     # Signals of one plant are generated for 600 samples at a time, unless a reset comes first.
     partial_resets = 0.005 if limit < 600 else 0.0
     compare(native, sync, steps=steps, rng=rng, partial_resets=partial_resets)
+
+
+def test_tensors_that_numpy_cannot_read_are_refused_with_the_reason():
+    torch = pytest.importorskip("torch", reason="its tensors are the actions")
+    zeros = torch.zeros(2, 1)
+    for actions, reason in [
+        (torch.zeros(2, 1, requires_grad=True), r"requires grad\. Use tensor\.detach\(\)"),
+        (zeros.bfloat16(), r"BFloat16; pass tensor\.detach\(\)\.float\(\)\.cpu\(\)"),
+        (zeros.to("meta"), r"meta device .* Use Tensor\.cpu\(\)"),
+    ]:
+        for env, name in (MiddlePointVectorEnv(2), "actions"), (MiddlePointEnv(), "action"):
+            env.reset(seed=0)
+            with pytest.raises(ValueError, match=rf"(?s)^{name} must be .*{reason}"):
+                env.step(actions)
+    native = MiddlePointVectorEnv(2)
+    native.reset(seed=0)
+    native.step(zeros)
 
 
 def test_a_plant_costs_a_few_kib_and_nothing_grows_in_the_long_run():

@@ -28,9 +28,9 @@ Number = float | Sequence[float]  # a number, or a range [low, high]
 Check = Callable[[str, Any], Any]  # takes the name of an argument and its value
 
 
-def reject(name: str, value: object, allowed: str) -> NoReturn:
-    """Raise a ValueError with the message "`name` must be `allowed`, got `value`"."""
-    raise ValueError(f"{name} must be {allowed}, got {shorten(value)}") from None
+def reject(name: str, value: object, allowed: str, reason: str = "") -> NoReturn:
+    """Raise a ValueError with the message "`name` must be `allowed`, got `value``reason`"."""
+    raise ValueError(f"{name} must be {allowed}, got {shorten(value)}{reason}") from None
 
 
 def shorten(value: object) -> str:
@@ -61,7 +61,7 @@ def one_action(action: Any) -> float:
     """
     array = _as_float64(action)
     if array is None or array.size != 1 or not math.isfinite(array.item()):
-        reject("action", action, "one finite number, shape (1,)")
+        reject("action", action, "one finite number, shape (1,)", _why_unreadable(action))
     return array.item()
 
 
@@ -87,7 +87,8 @@ def many_actions(
     """
     array = _as_float64(actions)
     if array is None or array.shape != (num_envs, 1):
-        reject("actions", actions, f"numbers, shape ({num_envs}, 1)")
+        allowed = f"numbers, shape ({num_envs}, 1)"
+        reject("actions", actions, allowed, _why_unreadable(actions))
     checked = array.ravel()
     if ignored is not None:
         checked[ignored] = 0.0
@@ -104,6 +105,21 @@ def _as_float64(values: Any) -> NDArray[np.float64] | None:
         return np.asarray(values).astype(_FLOAT64, casting="same_kind")
     except NOT_A_NUMBER:
         return None
+
+
+def _why_unreadable(values: Any) -> str:
+    """Return why NumPy cannot read a tensor, as the end of an error message; "" if it can.
+
+    Such a tensor has a gradient, has a type that NumPy lacks, such as bfloat16, or is not in
+    the memory of the CPU. Other values than tensors are shown by the message.
+    """
+    if hasattr(values, "detach"):  # a tensor
+        try:
+            np.asarray(values)
+        except NOT_A_NUMBER as error:
+            reason = str(error).rstrip(".")
+            return f": {reason}; pass tensor.detach().float().cpu()"
+    return ""
 
 
 def to_python(value: Any) -> Any:
