@@ -1,4 +1,4 @@
-"""Implement a controller that identifies the plant during control, by a bank of models."""
+"""Implement a controller that identifies the plant during control."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mptc_gym.plant.actuator import applied_flow, avoid_dead_zone
 from mptc_gym.plant.checks import count_from_0, not_negative, positive
 
-from .bank import Bank
 from .controller import ModelBasedController
+from .estimator import Candidates, Estimator
 from .hedge import RandomSetpoint
-from .law import Law
 
-Array = NDArray[np.floating[Any]]
+Array = NDArray[np.float64]
 
-# Time constants of the candidate models, as multiples of the step test's time constant.
+# Candidate time constants, as multiples of the step test's time constant.
 TIME_CONSTANTS: Final = np.array([0.63, 1.0, 1.55])
 # Shortest delay, longest delay and standard deviation of the prior distribution of the delay,
 # as multiples of the step test's delay, if `delay_range` is None.
@@ -27,9 +27,9 @@ LONGEST_DELAY: Final = 2.0
 DELAY_SPREAD: Final = 0.33
 # Prior standard deviation of the natural logarithm of the time constant.
 CONSTANT_SPREAD: Final = 0.3
-# Distance of the smallest flow from the dead zone, as a share of half the flow range. This
-# distance keeps a flow out of the dead zone after rounding to float32.
-CLEARANCE: Final = 1e-4
+# Share of the gap between the response and its target that a flow closes in one sample.
+CLOSED_SHARE: Final = 0.5
+REACTION: Final = 2.0  # samples, after the delay, that the output takes to respond to a flow
 # Longest time constant, in samples, for which the controller's settings were chosen. For a time
 # constant that is n times as long, the controller changes the command at every n-th sample.
 LONGEST_TIME_CONSTANT: Final = 45.0
@@ -58,18 +58,16 @@ def _transport_delay(delay: float) -> int:
 class SelfTuningController(ModelBasedController):
     """A predictive controller that identifies the plant during control.
 
-    The controller has four parts:
-
-    - Candidate models with different delays and time constants run in parallel with the plant
-      (`agents.bank`). A model with small prediction errors has a large weight (Magill, "Optimal
-      adaptive estimation of sampled stochastic processes", IEEE Transactions on Automatic
-      Control 10, 1965, 434-439).
-    - Kalman filters estimate the plant's gain and load disturbance (`agents.output_filter`).
+    - Candidates for the plant have different delays, time constants and load disturbances. One
+      linear filter gives the gain, the probability and the forecast of each candidate
+      (`agents.estimator`, with the derivation).
     - If `setpoint_holds` is given, the target of the output lies between the set point and 0,
       because the set point may change within the plant's delay (`agents.hedge`).
-    - As in a Smith predictor, the models predict the effect of past flows that have not yet
-      affected the output. The next flow moves the predicted output towards the target
-      (`agents.law`).
+    - As in a Smith predictor, the next flow moves the predicted output towards the target. The
+      prediction includes the effect of past flows that have not yet affected the output.
+
+    The candidates have the fast pole, the ratio of the coefficients of B and the coefficient of
+    z^-1 in C of equation (28) of the paper.
 
     Every command is 0 or outside the dead zone. The controller suits plants with a positive or
     negative gain, any flow limits outside the dead zone and any sampling interval, because all
@@ -123,9 +121,11 @@ class SelfTuningController(ModelBasedController):
         # The unit of temperatures is the steady temperature change for half the flow range.
         self._unit_flow = math.copysign((self.u_max - self.u_min) / 2.0, self.gain)
         self._unit_temperature = self.gain * self._unit_flow
+        self._candidates = self._new_candidates()
+        self._random_setpoint = self._setpoint_distribution()
 
-    def _new_bank(self, n: int) -> Bank:
-        """Return the candidate models of n plants, with their prior probabilities."""
+    def _new_candidates(self) -> Candidates:
+        """Return the candidates for a plant, with their prior probabilities."""
         likely = self.delay / self._interval
         if self.delay_range is None:
             shortest = SHORTEST_DELAY * likely
@@ -139,11 +139,10 @@ class SelfTuningController(ModelBasedController):
         # distribution.
         delay_logarithms = -0.5 * np.square((delays + 1.0 - likely) / spread)
         constant_logarithms = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
-        return Bank(
+        return Candidates(
             time_constants=self._time_constant * TIME_CONSTANTS,
             delays=delays,
-            log_probabilities=delay_logarithms[:, np.newaxis] + constant_logarithms,
-            n=n,
+            log_priors=delay_logarithms[:, np.newaxis] + constant_logarithms,
         )
 
     def _setpoint_distribution(self) -> RandomSetpoint | None:
@@ -171,9 +170,9 @@ class SelfTuningController(ModelBasedController):
         if self._k == 0:
             return {}
         return {
-            "gain": self.gain * self._law.output_filter.gain,
-            "time_constant": self._interval * np.exp(self._bank.log_constant),
-            "delay": self._interval * (self._bank.delay + 1.0),
+            "gain": self.gain * self._estimate.gain,
+            "time_constant": self._interval * self._estimate.time_constant,
+            "delay": self._interval * (self._estimate.delay + 1.0),
         }
 
     def reset(self) -> None:
@@ -181,30 +180,65 @@ class SelfTuningController(ModelBasedController):
         super().reset()
         self._k = 0  # number of samples since the start of the episode
 
-    def _start(self, n: int) -> None:
-        """Create the estimators and the control law for n plants at the start of an episode."""
-        edge = 0.0
-        if self.dead_zone > 0.0:
-            edge = self.dead_zone / abs(self._unit_flow) + CLEARANCE
-        # On a plant with a negative gain, the unit of flow is negative, so the limits swap.
-        low, high = sorted([self.u_min / self._unit_flow, self.u_max / self._unit_flow])
-        self._bank = self._new_bank(n)
-        self._law = Law(self._bank, n, edge, (low, high), self._setpoint_distribution())
-
-    def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _control(self, rows: Array) -> Array:
         """Return the commands u(k), t/h, shape (loops,), and update the estimates.
 
         On a plant with a time constant of 90 samples or more, many calls return the commands of
         the previous call.
         """
         if self._k == 0:
-            self._start(len(rows))
+            self._start(rows)
         if self._k % self._samples_held == 0:
             setpoint = rows[:, self.setpoint_index] / self._unit_temperature
             output = setpoint - rows[:, self.error_index] / self._unit_temperature
-            flow = self._law.flow(setpoint.astype(np.float32), output.astype(np.float32))
+            self._estimate = self._estimator.observe(output)
+            wanted = self._unit_flow * self._wanted_flow(self._target(setpoint))
+            outside = avoid_dead_zone(wanted, self.dead_zone)
             # The commands, t/h, of this sample and of those until the next computation.
-            self._held = self._unit_flow * flow.astype(np.float64)
+            self._held: Array = np.clip(outside, self.u_min, self.u_max)
+            applied = applied_flow(self._held, self.dead_zone, self.u_min, self.u_max)
+            self._estimator.apply(applied / self._unit_flow)
         self._k += 1
-        command: NDArray[np.float64] = self._held
-        return command
+        return self._held
+
+    def _start(self, rows: Array) -> None:
+        """Create the estimator at the start of an episode, from its first observations."""
+        n = len(rows)
+        self._estimator = Estimator(self._candidates, n)
+        self._last_setpoint = rows[:, self.setpoint_index] / self._unit_temperature
+        # Number of samples since the last change of the set point. Before the first change, the
+        # number of observations since the start of the episode.
+        self._age = np.zeros(n)
+
+    def _target(self, setpoint: Array) -> NDArray[np.floating[Any]]:
+        """Return the outputs at which the flows of this sample aim, shape (n,).
+
+        `setpoint` are the set points y_d(k), shape (n,). The unit of set points and outputs is
+        the steady temperature change for half the flow range.
+        """
+        self._age = np.where(setpoint == self._last_setpoint, self._age + 1.0, 0.0)
+        self._last_setpoint = setpoint
+        if self._random_setpoint is None:
+            return setpoint
+        # Samples until the output has responded to the present flow, and probability that the
+        # set point does not change before.
+        ahead = self._estimate.delay + 1.0 + REACTION
+        held = self._random_setpoint.probability_held(self._age, ahead)
+        return self._random_setpoint.targets(setpoint, held, self._estimate.deviation)
+
+    def _wanted_flow(self, target: NDArray[np.floating[Any]]) -> Array:
+        """Return the flows u(k) that move the outputs towards `target`, shape (n,).
+
+        Flows and temperatures are dimensionless, as in `agents.estimator`. Dead zone and limits
+        have no effect on the result.
+        """
+        estimate = self._estimate
+        # By (a) in `agents.estimator`, the output y(k+d+1) is g s(k+1) + r(k+d+1), so this is
+        # the target of the response g s.
+        wanted = target - estimate.forecast
+        # The flow `wanted / g` keeps the response at `wanted`. In one sample, a further flow
+        # changes the response of a model of first order by (1 - pole) g times the flow.
+        pole = np.exp(-1.0 / estimate.time_constant)
+        approach = CLOSED_SHARE * (wanted - estimate.response) / (1.0 - pole)
+        flow: Array = (wanted + approach) / estimate.gain
+        return flow

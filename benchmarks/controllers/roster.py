@@ -209,10 +209,11 @@ def dahlin(plant: KnownPlant, runs: int, seed: int) -> Made:
 
 
 def self_tuning(plant: KnownPlant, runs: int, seed: int) -> Made:
-    """Return a self-tuning controller, which selects the best of a bank of plant models.
+    """Return a self-tuning controller, which weighs candidates for the plant.
 
     The controller knows a step test, the limits, the largest dead zone, and the ranges of the
-    delay and of the set points.
+    delay and of the set points. It assumes the shape of the paper's polynomials: their fast
+    pole, the ratio of the coefficients of B, and the colour of the noise.
     """
     controller = SelfTuningController(
         dead_zone=plant.widest_dead_zone,
@@ -324,8 +325,9 @@ _SPECS = (
         group="step test",
         learns=True,
         make=self_tuning,
-        knows=f"{_KNOWS_DATA_SHEET}; delay range; hold times of random set points",
-        searched="about 70 settings by hand; one step test",
+        knows=f"{_KNOWS_DATA_SHEET}; delay range; hold times of random set points; fast pole, "
+        "ratio of the coefficients of B, and noise colour of the paper's plant",
+        searched="about 20 settings by hand; one step test",
     ),
     ControllerSpec(
         name="mpc",

@@ -1,13 +1,24 @@
-"""Test the self-tuning controller: its bank of models, its filters and its hedge."""
+"""Test the self-tuning controller: its filter, its candidates and its hedge."""
+
+import copy
+import pickle
 
 import numpy as np
 import pytest
 from scipy import signal
 
-from agents import SelfTuningController, output_filter
-from agents.bank import FAST_POLE, GAIN_SPREAD, NOISE_COLOUR
+from agents import SelfTuningController, estimator
+from agents.estimator import (
+    FAST_POLE,
+    FIRST_NOISE,
+    FIRST_NOISE_SAMPLES,
+    LOAD_MEMORY,
+    NEWER_SHARE,
+    NOISE_COLOUR,
+    Candidates,
+    Estimator,
+)
 from agents.hedge import RandomSetpoint
-from agents.output_filter import LOAD_MEMORY, READING_SHARE, OutputFilter
 from benchmarks.loop.runs import make_plants, simulate
 from tests.conftest import STEP_TEST
 
@@ -42,34 +53,56 @@ def test_it_identifies_the_plant(delay, gain, time_constant, noise):
     assert estimates["time_constant"] == pytest.approx(constant, rel=0.25)
 
 
-def test_gain_and_load_are_those_of_all_samples_at_once(rng, monkeypatch):
-    # The unknowns and the outputs are jointly normal: condition them in one step.
-    pole, variance, samples = 0.95, 0.04, 60
-    change, drift = 0.02, output_filter.GAIN_CHANGE * GAIN_SPREAD
-    monkeypatch.setattr(output_filter, "LOAD_CHANGES", np.array([change]))
-    monkeypatch.setattr(output_filter, "NOISE_SHARES", np.array([1.0]))
-    responses = np.cumsum(rng.normal(size=samples)) / 5.0
-    outputs = 1.1 * responses + 0.2 * rng.normal(size=samples)
-    kalman = OutputFilter(1)
-    for output, response, last in zip(outputs, responses, [0.0, *responses], strict=False):
-        newest = np.array([[response], [last]])
-        kalman.update(np.array([output]), newest, np.array([pole]), np.array([variance]))
-    a1, a2 = pole + FAST_POLE, -pole * FAST_POLE
-    # Responses of v(k), k = 1 to the last, to unit xi(j) and eta(j), in column j.
-    units, of_v = np.eye(samples), [1.0, -a1, -a2]
-    of_noise = signal.lfilter([1.0, NOISE_COLOUR[0]], of_v, units, axis=0)
-    w = signal.lfilter([1.0], [1.0, -LOAD_MEMORY], units, axis=0)
-    of_load = signal.lfilter([1.0 - a1 - a2], of_v, w, axis=0)
-    walks = np.minimum.outer(np.arange(1, samples + 1), np.arange(1, samples + 1))
-    gains = GAIN_SPREAD**2 + drift**2 * walks
-    covariance = (1.0 - READING_SHARE) * variance * of_noise @ of_noise.T
-    covariance += change**2 * of_load @ of_load.T + responses[:, None] * gains * responses
-    covariance += READING_SHARE * variance * np.eye(samples)
-    surprise = np.linalg.solve(covariance, outputs - responses)
-    gain = 1.0 + gains[-1] * responses @ surprise
-    assert kalman.gain[0] == pytest.approx(gain, abs=1e-9)
-    load = change**2 * (of_load @ w[-1]) @ surprise
-    assert kalman.load[0] == pytest.approx(load, abs=1e-9)
+def polynomials(pole):
+    """Return the polynomials A and B of a candidate with this slow pole."""
+    A = np.convolve([1.0, -pole], [1.0, -FAST_POLE])
+    return A, A.sum() * np.array([0.0, NEWER_SHARE, 1.0 - NEWER_SHARE])
+
+
+def test_the_forecast_is_that_of_all_samples_at_once(rng, monkeypatch):
+    # The residuals of one candidate are jointly normal: condition the future on the past.
+    pole, delay, samples, load_change, gain = 0.9, 3, 300, 0.2, 1.3
+    monkeypatch.setattr(estimator, "LOAD_CHANGES", (load_change,))
+    monkeypatch.setattr(estimator, "GAIN_LIMITS", (gain, gain))
+    time_constants = np.array([-1.0 / np.log(pole)])
+    plants = Estimator(Candidates(time_constants, np.array([delay]), np.zeros((1, 1))), 1)
+    flows, outputs = rng.normal(size=(2, samples))
+    for output, flow in zip(outputs, flows, strict=True):
+        estimate = plants.observe(np.array([output]))
+        plants.apply(np.array([flow]))
+
+    A, B = polynomials(pole)
+    response = signal.lfilter(B, A, np.concatenate([np.zeros(delay), flows]))[:samples]
+    residuals = outputs - gain * response
+    # Responses of r(k), up to d + 1 samples ahead, to unit xi(j) and eta(j) in column j.
+    units = np.eye(samples + delay + 1)
+    of_noise = signal.lfilter([1.0, NOISE_COLOUR], A, units, axis=0)
+    of_load = signal.lfilter([A.sum()], np.convolve(A, [1.0, -LOAD_MEMORY]), units, axis=0)
+    covariance = of_noise @ of_noise.T + load_change**2 * of_load @ of_load.T
+    past = covariance[:samples, :samples]
+    of_past = np.linalg.solve(past, covariance[:samples, -1])
+    assert estimate.forecast[0] == pytest.approx(of_past @ residuals, abs=1e-6)
+    # The variance of the noise is a mean of its prior and of the squared one-step errors.
+    squares = (
+        residuals @ np.linalg.solve(past, residuals) + FIRST_NOISE_SAMPLES * FIRST_NOISE**2
+    )
+    variance = covariance[-1, -1] - of_past @ covariance[:samples, -1]
+    deviation = np.sqrt(squares / (FIRST_NOISE_SAMPLES + samples) * variance)
+    assert estimate.deviation[0] == pytest.approx(deviation, rel=0.01)
+
+
+def test_without_noise_the_candidate_that_is_the_plant_is_found(rng):
+    time_constants, delays, gain, delay = np.array([10.0, 20.0, 40.0]), np.arange(2, 9), 1.6, 5
+    plants = Estimator(Candidates(time_constants, delays, np.zeros((7, 3))), 1)
+    flows = rng.normal(size=400)
+    A, B = polynomials(np.exp(-1.0 / 20.0))
+    outputs = gain * signal.lfilter(B, A, np.concatenate([np.zeros(delay), flows]))
+    for output, flow in zip(outputs, flows, strict=False):
+        estimate = plants.observe(np.array([output]))
+        plants.apply(np.array([flow]))
+    assert estimate.delay == pytest.approx(delay, abs=1e-3)
+    assert estimate.gain == pytest.approx(gain, rel=1e-3)
+    assert estimate.time_constant == pytest.approx(20.0, rel=1e-3)
 
 
 def test_no_other_target_has_less_error(rng):
@@ -104,6 +137,48 @@ def test_neither_a_wrong_gain_nor_a_steady_load_leaves_an_offset():
     trajectory = simulate(plants, controller, 900, 5_900_000)
     errors = (trajectory.setpoint - trajectory.output)[700:]
     assert np.abs(errors).mean() < 0.05
+
+
+@pytest.mark.parametrize(("time_constant", "delay"), [(5, 20), (10, 40), (20, 20)])
+def test_a_calm_plant_stays_calm(time_constant, delay):
+    # A plant of first order, which equals its step test, and on which nothing ever happens.
+    pole, gain = np.exp(-1.0 / time_constant), -0.7
+    plant = {"a": (1.0, -pole), "b": (gain * (1.0 - pole),), "c": (1.0,), "dead_zone": 0.0}
+    test = {"gain": gain, "time_constant": 8.0 * time_constant, "delay": 8.0 * (delay + 1)}
+    plants = make_plants(1, 3000, **plant, delay=delay, setpoint=4.0)
+    trajectory = simulate(plants, SelfTuningController(**test, dead_zone=0.0), 3000, 0)
+    errors = trajectory.setpoint - trajectory.output
+    assert np.abs(errors[600:]).max() < 0.02
+
+
+def test_one_plant_with_a_gain_above_0_and_one_sided_limits():
+    test = {"gain": 0.5, "time_constant": 160.0, "delay": 80.0, "u_min": 0.0, "u_max": 20.0}
+    pole = np.exp(-1.0 / 20.0)
+    plant = {"a": (1.0, -pole), "b": (0.6 * (1.0 - pole),), "c": (1.0,), "delay": 9}
+    plant |= {"u_min": 0.0, "u_max": 20.0, "dead_zone": 2.0, "setpoint": 6.0}
+    controller = SelfTuningController(**test, dead_zone=2.0)
+    trajectory = simulate(make_plants(1, 600, **plant), controller, 600, 0)
+    assert np.abs(trajectory.setpoint - trajectory.output)[300:].max() < 0.02
+    assert controller.estimates["gain"] == pytest.approx([0.6], rel=0.05)
+
+
+@pytest.mark.parametrize("renewed", [copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))])
+def test_a_copy_in_mid_episode_goes_on_alike(observations, renewed):
+    controller = SelfTuningController(**KNOWN, setpoint_holds=(80.0, 800.0))
+    for rows in observations[:60]:
+        controller.act(rows)
+    twin = renewed(controller)
+    for rows in observations[60:]:
+        assert np.array_equal(controller.act(rows), twin.act(rows))
+    assert np.array_equal(controller.estimates["delay"], twin.estimates["delay"])
+
+
+def test_each_loop_of_a_batch_is_a_single_loop(observations):
+    batch = SelfTuningController(**KNOWN)
+    singles = [SelfTuningController(**KNOWN) for _ in range(3)]
+    for rows in observations:
+        alone = [single.act(row) for single, row in zip(singles, rows, strict=True)]
+        np.testing.assert_allclose(batch.act(rows), alone, atol=1e-5)
 
 
 class TestScales:
