@@ -101,6 +101,10 @@ def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, caps
         for spec in gymnasium.registry.values():
             if spec.id.startswith("MiddlePoint"):
                 monkeypatch.setattr(spec, "max_episode_steps", 30)
+    if "gymnasium.utils.play" in example:  # the window is closed at once
+        pygame = pytest.importorskip("pygame")
+        closed = pygame.event.Event(pygame.QUIT)
+        monkeypatch.setattr(pygame.event, "get", lambda: [closed])
     # An example whose output is not on the page runs for a short time only.
     exec(example if printed else shortened(example), {})
     if printed:
