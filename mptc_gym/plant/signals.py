@@ -110,6 +110,7 @@ class RandomSignal(ABC):
         samples = len(self._block) - first_row
         for start in range(0, len(plants), PLANTS_AT_A_TIME):
             chunk = plants[start : start + PLANTS_AT_A_TIME]
+            # Every plant has begun an episode, as the first reset includes all plants.
             generators = [self._streams[i].generator for i in chunk.tolist()]
             # A slice is much faster than indices, but needs plants without gaps.
             has_gaps = chunk[-1] - chunk[0] >= len(chunk)
@@ -268,7 +269,7 @@ class RepeatedSetPoint:
         The caller must not modify the returned array.
         """
         self._clock += 1
-        if self._clock >= self._next_change:
+        if self._clock >= self._next_change:  # also right after a reset
             self._present, unchanged_samples = self._at(self._clock - self._starts)
             self._next_change = self._clock + unchanged_samples
         return self._present
@@ -406,8 +407,8 @@ class Disturbance(RandomSignal):
         changes = (ages + samples) // LOAD_INTERVAL  # of the load of each plant
         self._ages[plants] = (ages + samples) % LOAD_INTERVAL
         # For each change, three random numbers from 0 to 1: one for the step of the walk, one
-        # that decides whether the level jumps, and one for the new level. The last change of
-        # some plants may be one too many, and is not used.
+        # that decides whether the level jumps, and one for the new level. A plant may have one
+        # change less than another. Its last column stays 0, and is not read below.
         uniform = np.zeros((len(plants), changes.max(), 3))
         draws = zip(generators, uniform, changes.tolist(), strict=True)
         for generator, uniform_of_plant, count in draws:
