@@ -253,7 +253,7 @@ class TestCompare:
         out = compared(option, "--agent", f"{name}=agents:PIController")
         page = " ".join((out / "report.md").read_text().split())
         assert f"| {name} |" in page
-        assert f"only these controllers: Dahlin, PPO, NN (1992), PI (1992), {name}." in page
+        assert "PPO, and your own controllers. The file CASE.csv" in page
         assert (out / "scores.png").exists()
         # Ms of the paper's gains, which the own controller has, too, and of three tuned rules.
         assert page.count("| unstable |") == 2

@@ -113,7 +113,8 @@ def row(case: Scenario, mpc_runs: int | None) -> dict[str, str]:
     for the column "surprise" if the set point changes before the plant has settled.
     """
     reference = partial(reference_error, samples=case.samples, **case.arguments)
-    # Formatting an `Estimate`, as in f"{estimate:.4f}", adds the interval in parentheses.
+    # Formatting an `Estimate`, as in f"{estimate:.4f}", adds the interval in parentheses. The
+    # error of an idle valve is the same for all kinds, of which every case has "preview".
     cells = {"case": case.name, "idle valve": f"{reference(kind='preview').idle:.4f}"}
     for kind, heading in HEADINGS.items():
         cells[heading] = ""

@@ -219,6 +219,7 @@ def costs_table(comparison: Comparison) -> pd.DataFrame:
         row = {
             "controller": controller.label,
             "prior knowledge": controller.knows,
+            # Results are in the order of the cases: Ms is that with the plant of the first.
             "Ms": sensitivity_text(results[0].sensitivity),
             "searched or trained": controller.searched,
             "processor time (s)": f"{sum(result.seconds for result in results):.1f}",

@@ -140,6 +140,7 @@ def check_own(controller: ControllerSpec, scenario: Scenario, runs: int, seed: i
         for member in controller.members():
             policy, arguments = member.start(scenario.arguments, runs, seed)
             plants = make_plants(runs, scenario.samples, **arguments)
+            # The user chose the interface, so it may differ from that of a model's training.
             check_fit(policy, plants, is_made_by_user=True)
     except ValueError as error:
         raise CommandError(f"--agent {controller.name}, {scenario.name}: {error}") from error

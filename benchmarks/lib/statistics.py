@@ -52,12 +52,12 @@ def student(values: ArrayLike) -> Estimate:
     `values` has one value for each run, shape (runs,). If `values` has only one value, or equal
     values, the interval has zero width.
     """
-    numbers = np.asarray(values, dtype=np.float64)
-    mean = float(numbers.mean())
-    runs = len(numbers)
-    if runs < 2 or np.ptp(numbers) == 0.0:
+    sample = np.asarray(values, dtype=np.float64)
+    mean = float(sample.mean())
+    runs = len(sample)
+    if runs < 2 or np.ptp(sample) == 0.0:
         return Estimate(mean, mean, mean, runs)
-    standard_error = float(numbers.std(ddof=1)) / math.sqrt(runs)
+    standard_error = float(sample.std(ddof=1)) / math.sqrt(runs)
     # The quantile of scipy.stats.t, which takes long to import.
     half_width = float(scipy.special.stdtrit(runs - 1, INTERVAL_ENDS[1])) * standard_error
     return Estimate(mean, mean - half_width, mean + half_width, runs)

@@ -160,6 +160,7 @@ def simulate_together(
 
     def act(observations: Any) -> Array:
         """Return the actions of all controllers, each from the observations of its runs."""
+        # The plants of a controller follow those of the controller before, as in `seeds` below.
         parts = zip(acts, np.split(observations, len(acts)), strict=True)
         return np.concatenate([act_of_agent(part) for act_of_agent, part in parts])
 
