@@ -14,11 +14,9 @@ import functools
 import inspect
 import math
 import pickle
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -60,8 +58,6 @@ MOST_BLOCK_SAMPLES = 64  # most samples in a block, which bounds the memory of a
 # On a CPU, the most values of a signal in a block of more than `DRIFT_INTERVAL` samples:
 # 512 KiB of float32, which fit in the cache.
 VALUES_IN_CACHE = 1 << 17
-# Names of the observed values in `MiddlePointTorchEnv._ahead`.
-OBSERVED = "observed_setpoint", "observed_error", "observed_output"
 
 
 def _uniform(low: float, high: float, zeros: Tensor, generator: torch.Generator) -> Tensor:
@@ -226,8 +222,12 @@ class _WantedFlows(WantedFlows):
 
     @staticmethod
     def _to_float32(values: Any) -> Any:
-        """Round a tensor to float32, and return it in its own type."""
-        return values.to(torch.float32).to(values.dtype)
+        """Round a tensor to float32, and return it in its own type, with the same gradient."""
+        if values.dtype is torch.float32:
+            return values
+        exact = values.detach()
+        # Added, as a conversion of `values` would round the gradient to float32 as well.
+        return values + (exact.to(torch.float32).to(values.dtype) - exact)
 
 
 class _Plants:
@@ -246,19 +246,20 @@ class _Plants:
         Gain factor and time constant factor in the latest block.
     """
 
-    def __init__(self, parameters: Parameters, zeros: Tensor) -> None:
+    def __init__(self, parameters: Parameters, zeros: Tensor, differentiable: bool) -> None:
         self._parameters = parameters
         self._zeros = zeros
+        self._differentiable = differentiable
         self._dynamics = Dynamics(parameters)
         self._limits = parameters.lowest.u_min, parameters.lowest.u_max
         self._half_range = (self._limits[1] - self._limits[0]) / 2.0
         self._middle = zeros.new_tensor(sum(self._limits) / 2.0)
         self._shortest_delay, self._longest_delay = map(int, parameters.range_of("delay"))
         self.most_samples = self._shortest_delay + 1
-        # The applied flows that the polynomial B still needs, t/h, the oldest first. The first
-        # of them is that of the longest delay and the last term of B.
-        flows = self._longest_delay + len(parameters.b)
-        self._flows = deque([zeros] * flows, flows)
+        # The applied flows that the polynomial B still needs, t/h, the oldest first. At the
+        # start of a block, the first of them is that of the longest delay and the last term of
+        # B. No deque, as `torch.compile` forgets the length of a deque.
+        self._flows = [zeros] * (self._longest_delay + len(parameters.b))
         # Temperatures of the samples before the latest block, which A needs, and of the block.
         self._outputs = [zeros] * (len(parameters.a) - 1)
 
@@ -266,7 +267,7 @@ class _Plants:
         """Bring the plants in `mask` to rest, with the parameter values `numbers`."""
         self._numbers = numbers
         self._outputs = [row.masked_fill(mask, 0.0) for row in self._outputs]
-        self._flows.extend([row.masked_fill(mask, 0.0) for row in self._flows])  # replaces all
+        self._flows = [row.masked_fill(mask, 0.0) for row in self._flows]
         # A command is scaled to an action and back in up to eight operations, each with a
         # relative error of at most half an eps.
         rounding = 4.0 * torch.finfo(self._zeros.dtype).eps
@@ -291,7 +292,7 @@ class _Plants:
             dead zone, and 0 beyond the limits.
         """
         command = torch.add(self._middle, a, alpha=self._half_range)
-        if command.requires_grad:
+        if self._differentiable:
             # The value in the dead zone is 0, but the gradient is that of the command.
             limited = command.clamp(*self._limits)
             is_lost = command.detach().abs().le_(self._edge)
@@ -325,14 +326,16 @@ class _Plants:
 
     def end_block(self, samples: int) -> None:
         """Forget the latest block, except for its first samples, which steps have returned."""
-        # As many temperatures up to the present sample as A needs.
+        # As many temperatures up to the present sample as A needs, and as many flows as B needs
+        # with the longest delay.
         order = len(self._parameters.a) - 1
         self._outputs = self._outputs[samples : samples + order]
+        del self._flows[: -(self._longest_delay + len(self._parameters.b))]
 
     def detach(self) -> None:
         """Cut the gradient graph of earlier actions."""
         self._outputs = [row.detach() for row in self._outputs]
-        self._flows.extend([row.detach() for row in self._flows])  # replaces all
+        self._flows = [row.detach() for row in self._flows]
 
     def _update_dynamics(self, k: SampleNumber) -> None:
         """Update the coefficients of equation (28) to the latest change up to sample k."""
@@ -350,7 +353,7 @@ class _Plants:
         rows = samples + len(beta) - 1
         rows_of_all_delays = rows + self._longest_delay - self._shortest_delay
         # The first row is that of the longest delay and the last term of B.
-        flows = torch.stack([*islice(self._flows, rows_of_all_delays)])
+        flows = torch.stack(self._flows[:rows_of_all_delays])
         if isinstance(self._numbers.delay, Tensor):
             flows = flows.gather(0, self._delayed_rows[:rows])
         response = self._zeros
@@ -375,7 +378,7 @@ class _Window:
 
     def __init__(self, windows: Sequence[int], zeros: Tensor) -> None:
         # For each variable, the values in the observations, shape (n,) each, the newest first.
-        self._rows = [deque([zeros] * window, window) for window in windows]
+        self._rows = [[zeros] * window for window in windows]
 
     def reset(self, mask: Tensor, setpoint: Tensor, rest_action: Tensor) -> None:
         """Fill the observations of the plants in `mask` with the values of a plant at rest.
@@ -388,8 +391,9 @@ class _Window:
         newest = setpoint, setpoint, zeros, observed_action  # the temperature is 0
         earlier = zeros, zeros, zeros, observed_action
         for rows, newest_value, earlier_value in zip(self._rows, newest, earlier, strict=True):
-            values = zip([newest_value, *[earlier_value] * len(rows)], rows, strict=False)
-            rows.extend([torch.where(mask, value, row) for value, row in values])
+            for i, row in enumerate(rows):
+                value = earlier_value if i else newest_value
+                rows[i] = torch.where(mask, value, row)
 
     def add(self, setpoint: Tensor, error: Tensor, output: Tensor, action: Tensor) -> Tensor:
         """Add a sample of each plant, and return the observations, shape (n, size).
@@ -397,12 +401,11 @@ class _Window:
         The sample consists of set points y_d(k+1), observed errors and outputs, all in degC,
         and normalised actions a(k), each of shape (n,).
         """
-        setpoints, errors, outputs, actions = self._rows
-        setpoints.appendleft(setpoint)
-        errors.appendleft(error)
-        outputs.appendleft(output)
-        if actions:
-            actions.appendleft(action.clamp(-1.0, 1.0))
+        if self._rows[-1]:
+            action = action.clamp(-1.0, 1.0)
+        for rows, newest in zip(self._rows, (setpoint, error, output, action), strict=True):
+            rows.insert(0, newest)
+            rows.pop()  # the oldest, or `newest` if the window is empty
         return self.present()
 
     def present(self) -> Tensor:
@@ -411,8 +414,24 @@ class _Window:
 
     def detach(self) -> None:
         """Cut the gradient graph of earlier actions."""
-        for rows in self._rows:
-            rows.extend([row.detach() for row in rows])
+        self._rows = [[row.detach() for row in rows] for rows in self._rows]
+
+
+class _Step(NamedTuple):
+    """What a step that ends no episode returns, in tensors of shape (n,)."""
+
+    observed: tuple[Tensor, Tensor, Tensor]  # set points, errors and measured outputs, degC
+    rewards: Tensor  # without the cost of changed actions
+    terminations: Tensor
+    truncations: Tensor
+    infos: Infos  # without commanded and applied flows
+
+    def detach(self) -> _Step:
+        """Return the same step without the gradient graph of earlier actions."""
+        infos = {name: values.detach() for name, values in self.infos.items()}
+        setpoint, error, output = self.observed
+        observed = setpoint, error.detach(), output.detach()
+        return self._replace(observed=observed, rewards=self.rewards.detach(), infos=infos)
 
 
 def _outside_inference_mode(method: Any) -> Any:
@@ -494,9 +513,16 @@ class MiddlePointTorchEnv(BatchEnv):
     `action="change"`, an action has the gradient 0 beyond +-1. `detach` cuts the gradient graph
     for truncated backpropagation. An action affects the temperature after `delay` + 1 samples,
     so fewer samples than that between two calls of `detach` give no gradient through the plant.
-    If `differentiable` is False, the environment keeps no gradient graph of actions. A copy or
+    If `differentiable` is False, all gradients with respect to actions are 0, and the
+    environment keeps no gradient graph of actions. `torch.func.jacrev` and `torch.func.jacfwd`
+    give the same derivatives; `jacfwd` needs `randomness="same"` if the environment draws
+    random numbers. `torch.vmap` over environments is not supported. A copy or
     a pickle of the environment, even in the middle of an episode, has no gradient graph of
     earlier actions.
+
+    **Compilation.** A function that calls `step`, such as a loss over many steps, has the same
+    values and gradients with `torch.compile`. But the compiled graph breaks within each step,
+    and compilation may take minutes, so it is better to compile only the policy.
 
     **Waiting.** If the actions are a tensor on the device, `step` does not wait for the device
     to finish its computations. As a check of the actions would wait for the device, `step`
@@ -552,12 +578,11 @@ class MiddlePointTorchEnv(BatchEnv):
             self._signals["disturbance"] = _Load(*random)
         for name, c in noise_polynomials(parameters).items():
             self._signals[name] = _Noise(name, c, *random)
-        self._plants = _Plants(parameters, self._zeros)
+        self._plants = _Plants(parameters, self._zeros, differentiable)
         self._wanted_flows = _WantedFlows(parameters, self._zeros)  # for the form "change"
         self._window = _Window(parameters.windows, self._zeros)
         self._block_samples = 0  # number of samples in the latest block
-        # What the remaining steps of the block return, by name, the next step last.
-        self._ahead: list[Infos] = []
+        self._ahead: list[_Step] = []  # the remaining steps of the block, the next step last
         self._most_samples = min(MOST_BLOCK_SAMPLES, self._plants.most_samples)
         if self.device.type == "cpu":
             # On other devices, blocks are as long as possible, as every call takes long.
@@ -587,8 +612,7 @@ class MiddlePointTorchEnv(BatchEnv):
         for part in (self._plants, self._window, self._wanted_flows):
             part.detach()
         self._action = self._action.detach()
-        for step in self._ahead:
-            step |= {name: row.detach() for name, row in step.items() if row.requires_grad}
+        self._ahead = [step.detach() for step in self._ahead]
 
     @_outside_inference_mode
     def _advance(self, a: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
@@ -601,15 +625,15 @@ class MiddlePointTorchEnv(BatchEnv):
         command, applied = self._plants.apply(a)
         if not self._ahead:
             self._compute_block()
-        infos = self._ahead.pop()
-        observations = self._window.add(*[infos.pop(name) for name in OBSERVED], a)
-        rewards = infos.pop("rewards")
+        step = self._ahead.pop()
+        observations = self._window.add(*step.observed, a)
+        rewards = step.rewards
         move_weight = self.parameters.move_weight
         if move_weight:
             rewards = rewards - move_weight * (a - self._action).abs()
             self._action = a.clone()  # a copy, as the caller may overwrite the actions
-        infos |= {"command": command, "applied": applied}
-        return observations, rewards, infos.pop("terminations"), infos.pop("truncations"), infos
+        infos = step.infos | {"command": command, "applied": applied}
+        return observations, rewards, step.terminations, step.truncations, infos
 
     def _compute_block(self) -> None:
         """Compute what the present step and the next steps return, up to an episode's end."""
@@ -634,20 +658,23 @@ class MiddlePointTorchEnv(BatchEnv):
         reading = reading.clamp(-span, span)
         blocks["output"] = output
         blocks["error"] = setpoint - output
-        blocks["rewards"] = self._rewards(blocks["error"])
-        # A copy, as the caller may overwrite the infos.
-        blocks["observed_setpoint"] = setpoint.clone()
-        blocks["observed_error"] = setpoint - reading
-        blocks["observed_output"] = reading
-        for name in ("terminations", "truncations"):  # `step` truncates the last step
-            blocks[name] = torch.zeros_like(output, dtype=torch.bool)
+        # A copy of the set points, as the caller may overwrite the infos.
+        observed = (setpoint.clone(), setpoint - reading, reading)
+        observed_rows = [*zip(*(block.unbind() for block in observed), strict=True)]
+        rewards = self._rewards(blocks["error"]).unbind()
+        terminations = torch.zeros_like(output, dtype=torch.bool).unbind()
+        # `BatchEnv.step` truncates the last step of an episode.
+        truncations = torch.zeros_like(output, dtype=torch.bool).unbind()
         rows = {name: block.unbind() for name, block in blocks.items()}
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         shared: Infos = {f"_{name}": everyone for name in self._info_names}
         if self.parameters.drifts:
             shared |= zip(FACTORS, self._plants.factors, strict=True)
         for i in reversed(range(samples)):  # the next step last, for `pop`
-            self._ahead.append({name: values[i] for name, values in rows.items()} | shared)
+            infos = {name: values[i] for name, values in rows.items()} | shared
+            self._ahead.append(
+                _Step(observed_rows[i], rewards[i], terminations[i], truncations[i], infos)
+            )
 
     def _end_block(self) -> None:
         """Drop the samples of the latest block that no step has returned."""
@@ -720,11 +747,11 @@ class MiddlePointTorchEnv(BatchEnv):
         """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended."""
         try:
             column = torch.as_tensor(actions, dtype=self.dtype, device=self.device)
-        except NOT_A_NUMBER:
-            reject("actions", actions, "numbers")
+        except NOT_A_NUMBER as error:
+            reject("actions", actions, f"numbers ({error})")
         if column.shape != (self.num_envs, 1):
             reject("actions", actions, f"numbers, shape ({self.num_envs}, 1)")
-        if column.requires_grad and not self.differentiable:
+        if not self.differentiable:
             column = column.detach()
         a: Tensor = column.reshape(-1)
         if self._ended is not None:

@@ -243,6 +243,50 @@ class TestGradients:
         env.step(actions)[-1]["output"].backward()
         assert actions.grad < 0.0
 
+    @pytest.mark.parametrize("plant", [
+        {}, {"dead_zone": [3, 7], "delay": [2, 4], **ALL_SHOWN}, {**ALL_SHOWN, **CHANGE},
+    ])  # fmt: skip
+    @pytest.mark.filterwarnings("ignore:.*jit.script:DeprecationWarning")  # within torch.func
+    @pytest.mark.parametrize("differentiable", [False, True])
+    def test_both_directions_of_differentiation_agree(self, plant, differentiable):
+        env = make(2, **{"delay": 2, "differentiable": differentiable, **plant})
+
+        def returned(actions):
+            env.reset(seed=0)
+            values = []
+            for a in actions:
+                observations, rewards, *_, infos = env.step(a)
+                signals = rewards, infos["output"], infos["applied"]
+                values.append(torch.cat([observations.ravel(), *signals]))
+            return torch.stack(values)
+
+        # In the dead zone, outside it, and beyond the limits.
+        actions = 1.3 * torch.arange(20, dtype=torch.float64).sin().reshape(10, 2, 1)
+        reverse = torch.func.jacrev(returned)(actions)
+        forward = torch.func.jacfwd(returned, randomness="same")(actions)
+        torch.testing.assert_close(forward, reverse, rtol=0, atol=1e-9)
+        assert forward.any() == differentiable
+
+    @pytest.mark.filterwarnings("ignore:The .grad attribute", "ignore::DeprecationWarning")
+    def test_a_compiled_loss_has_the_same_value_and_gradient(self):
+        env = make(2, differentiable=True, delay=1, **ALL_SHOWN)
+
+        def loss(actions):
+            observations = torch.zeros(2, 1)
+            for a in actions:
+                observations, rewards, *_ = env.step(a + 0.01 * observations.sum())
+            return rewards.sum() + observations.square().sum()
+
+        actions = torch.arange(12, dtype=torch.float64).cos().reshape(6, 2, 1).requires_grad_()
+        values, gradients = [], []
+        for function in (loss, torch.compile(loss, backend="eager")):
+            env.reset(seed=0)
+            values.append(function(actions))
+            gradients += torch.autograd.grad(values[-1], actions)
+        torch.testing.assert_close(values[1], values[0], rtol=0, atol=1e-9)
+        torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=1e-9)
+        assert gradients[0].any()
+
     def test_detach_cuts_what_was_before_and_nothing_else(self):
         totals, gradients = [], []
         for cut in (False, True):
@@ -320,6 +364,12 @@ def test_a_step_never_waits_for_the_device(arguments):
 def test_types_and_seeds_beyond_those_of_pytorch_are_named():
     with pytest.raises(ValueError, match=r"^dtype must be"):
         make(dtype=torch.float16)
+    env = make()
+    env.reset()
+    with pytest.raises(
+        ValueError, match=r"^actions must be numbers \(can't convert np.ndarray"
+    ):
+        env.step(np.array([["up"], ["down"]]))
     with pytest.raises(ValueError, match=r"^seed must be an integer from 0 to 9,223,372"):
         make().reset(seed=1 << 63)
 
