@@ -39,18 +39,13 @@ Action = NDArray[np.float32]
 def observation_space(parameters: Parameters) -> Space[Observation]:
     """Return the observation space of an environment, a float32 `Box` of shape (size,).
 
-    The bounds of observations depend on the set point only if the set point can exceed
-    +-`temperature_span`, so that a policy that was trained on one set point can run on another
-    set point.
+    The bounds of observations do not depend on the set point, so that a policy that was trained
+    on one set point can run on another set point.
     """
     span = parameters.temperature_span
-    setpoints = parameters.setpoint
-    if isinstance(setpoints, str):
-        setpoints = parameters.setpoint_amplitude
-    setpoint_limit = max(span, np.abs(setpoints).max())
     # The largest magnitudes of a set point, an error, an output and an action in an
     # observation.
-    limits = np.array([setpoint_limit, setpoint_limit + span, span, 1.0], np.float32)
+    limits = np.array([span, 2.0 * span, span, 1.0], np.float32)
     high = np.repeat(limits, parameters.windows)
     return Box(-high, high, dtype=np.float32)
 
@@ -193,9 +188,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     paper's neural network. Past actions in the observation are clipped to +-1, because the
     actuator limits the flow that an action beyond +-1 commands. With `action_window=delay+2`,
     otherwise default windows and polynomials, a constant set point, and without noise, load,
-    drifts and ranges, the control problem is a Markov decision process. If the set point can
-    exceed +-`temperature_span`, the bounds of set points and errors in the observation space
-    are wide enough to include the set point.
+    drifts and ranges, the control problem is a Markov decision process. A set point, or an
+    amplitude in use, beyond +-`temperature_span` is a ValueError.
 
     ## Reward
 

@@ -33,7 +33,7 @@ STEP_TEST = {"gain": -0.6825, "time_constant": 161.0, "delay": 152.0}
 
 small_numbers = st.floats(-0.3, 0.3)
 polynomials = st.lists(small_numbers, max_size=3).map(lambda tail: [1.0, *tail])
-setpoints = st.floats(-100, 100)
+setpoints = st.floats(-5, 5)
 # The strategy of an argument, by the check of the argument.
 BY_CHECK = {
     checks.number: small_numbers,
@@ -51,12 +51,13 @@ BY_CHECK = {
     | setpoints
     | st.lists(setpoints, min_size=1, max_size=5),
 }
-# Values of the actuator that fit together, and spans that readings often do not exceed.
+# Values of the actuator that fit together, and spans that readings often do not exceed, and set
+# points never.
 BY_NAME = {
     "dead_zone": st.floats(0, 10),
     "u_min": st.floats(-20, -10),
     "u_max": st.floats(0, 20),
-    "temperature_span": st.floats(0.5, 200),
+    "temperature_span": st.floats(5, 200),
 }
 STRATEGIES = BY_NAME | {
     name: BY_CHECK[argument.metadata["check"]]

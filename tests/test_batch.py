@@ -60,7 +60,7 @@ def assert_equal(ours, theirs):
 
 
 def test_spaces_modes_and_arguments_are_those_of_gymnasium_s_environments(library):
-    arguments = {"setpoint": 70.0, "output_window": 2}
+    arguments = {"temperature_span": 70.0, "output_window": 2}
     ours = library.make(3, **arguments)
     theirs = gymnasium.make_vec("MiddlePoint-v0", 3, vectorization_mode="sync", **arguments)
     for name in ("action_space", "observation_space"):

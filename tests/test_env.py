@@ -46,16 +46,30 @@ def test_observations_stay_in_their_space_whatever_the_actions(arguments, action
         assert env.observation_space.contains(observation)
 
 
-def test_spaces_whose_bounds_are_those_of_the_span_unless_a_set_point_is_beyond():
+def test_spaces_whose_bounds_are_those_of_the_span():
     for setpoint in ("square", "random", 5.0, [1.0, -3.0]):
         env = MiddlePointEnv(setpoint=setpoint, **dict.fromkeys(WINDOWS, 1))
         assert list(env.observation_space.high) == [50, 100, 50, 1]
         assert list(env.observation_space.low) == [-50, -100, -50, -1]
         assert env.action_space == gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-    beyond = MiddlePointEnv(setpoint=[5.0, -60.0], setpoint_window=1, error_window=1)
-    assert list(beyond.observation_space.high) == [60, 110]
-    amplitude = MiddlePointEnv(setpoint_amplitude=60.0, setpoint_window=1, error_window=1)
-    assert amplitude.observation_space == beyond.observation_space
+    wide = MiddlePointEnv(setpoint=60.0, temperature_span=60.0)
+    assert list(wide.observation_space.high) == [60] * 3 + [120] * 3
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("setpoint", {"setpoint": [5.0, -60.0]}),
+        ("setpoint", {"setpoint": 50.5}),
+        ("setpoint_amplitude", {"setpoint_amplitude": 60.0}),
+        ("setpoint_amplitude", {"setpoint": "random", "temperature_span": 4.0}),
+    ],
+)
+def test_a_set_point_beyond_the_transmitter_names_both(name, arguments):
+    with pytest.raises(ValueError, match=rf"^{name} must be .*temperature_span = "):
+        MiddlePointEnv(**arguments)
+    # An amplitude that is not in use is not limited.
+    MiddlePointEnv(**{**arguments, "setpoint": 1.0})
 
 
 def test_reset_is_at_rest():

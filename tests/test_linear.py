@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from agents import DahlinController, PIController, SmithPredictor
-from benchmarks.loop.linear import LinearLoop, nominal, step_test, time_constant_for
+from benchmarks.loop.linear import LinearLoop, nominal, step_test, time_constant_for, unfit
 from mptc_gym import MiddlePointEnv, Parameters
 from tests.conftest import STEP_TEST, run
 
@@ -56,6 +56,33 @@ def test_plant_without_a_new_steady_state_is_refused():
             step_test(Parameters(**{name: values}))
     # The gain of one that integrates has a sign.
     assert nominal(Parameters(a=[1.0, -1.0], b=[-0.1])).gain == -np.inf
+
+
+def test_an_integrator_with_rounding_errors_has_the_sign_of_its_b():
+    a = np.convolve([1.0, -1.0], np.convolve([1.0, -0.7], [1.0, -0.1]))  # A(1) = -8e-17
+    assert sum(a.tolist()) != 0.0
+    assert nominal(Parameters(a=a.tolist(), b=[0.1])).gain == np.inf
+    assert "the plant integrates" in unfit(Parameters(a=a.tolist(), b=[0.1]))
+
+
+@pytest.mark.parametrize(
+    ("sentence", "arguments"),
+    [
+        ("", {}),
+        ("the plant integrates", {"a": [1.0, -1.0]}),
+        ("the plant is not stable", {"a": [1.0, -1.1]}),
+        ("the gain of the plant is 0", {"b": [0.1, -0.1]}),
+        ("the plant is static", {"a": [1.0], "b": [0.5]}),
+        ("use a sampling_interval of 140 s", {"a": [1.0, -0.999], "b": [0.001]}),
+        ("the plant resonates", {"a": [1.0, -1.9, 0.999], "b": [0.1]}),
+        ("no flow from u_min=5 to u_max=10 t/h", {"u_min": 5.0, "setpoint": 5.0}),
+        ("", {"u_min": 5.0, "setpoint": -5.0}),
+    ],
+)
+def test_a_plant_that_the_commands_cannot_serve_is_refused_in_a_sentence(sentence, arguments):
+    found = unfit(Parameters(**arguments))
+    assert sentence in found
+    assert bool(found) == bool(sentence)
 
 
 @pytest.mark.parametrize(

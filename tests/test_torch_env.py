@@ -25,7 +25,7 @@ from mptc_gym.torch_env import MiddlePointTorchEnv, make_vec  # noqa: E402
 from tests.conftest import MODES, random_actions, valid_arguments  # noqa: E402
 
 HARD = PRESETS["hard"]
-SQUARE = {"setpoint": "square", "setpoint_period": 91, "temperature_span": 4.0}
+SQUARE = {"setpoint_period": 91, "setpoint_amplitude": 4.0, "temperature_span": 4.0}
 # Limits whose mean is not 0, so that the action of a plant at rest is not 0 either.
 ALL_SHOWN = {"action_window": 4, "output_window": 2, "move_weight": 0.1, "u_min": -12.0}
 CHANGE = {"action": "change", "max_move": 0.3, "compensated_dead_zone": 4.7}

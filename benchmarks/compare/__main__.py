@@ -22,6 +22,7 @@ from benchmarks.lib.command import (
 )
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.outputs import new_folder, provenance_of
+from benchmarks.loop.linear import unfit
 from benchmarks.loop.scenarios import (
     PRESET_SCENARIOS,
     SCENARIOS,
@@ -122,8 +123,8 @@ def work(options: Options) -> None:
 def cases(options: Options) -> tuple[str, dict[str, Scenario]]:
     """Return the name of the default output folder in `results/`, and the scenarios by name.
 
-    A `CommandError` is raised if `options` has options that exclude each other, or the name of
-    an unknown scenario.
+    A `CommandError` is raised if `options` has options that exclude each other, the name of an
+    unknown scenario, or a plant that is not for a scenario.
     """
     if options.presets and options.plant.name:
         raise CommandError("--presets cannot be combined with --plant, --preset and --set")
@@ -134,7 +135,12 @@ def cases(options: Options) -> tuple[str, dict[str, Scenario]]:
     else:
         folder_name, available = "compare", SCENARIOS
     names = options.scenarios or list(available)
-    return folder_name, choose("--scenarios", names, available)
+    chosen = choose("--scenarios", names, available)
+    for name, scenario in chosen.items():
+        reason = unfit(scenario.parameters)
+        if reason:
+            raise CommandError(f"the case {name}: {reason}")
+    return folder_name, chosen
 
 
 def fitting_the_gain(

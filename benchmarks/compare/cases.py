@@ -16,6 +16,7 @@ import numpy as np
 
 from benchmarks.bounds.reference import Reference, reference_error
 from benchmarks.controllers.roster import ControllerSpec
+from benchmarks.lib.command import CommandError
 from benchmarks.lib.statistics import percentiles
 from benchmarks.loop.linear import LinearController, LinearLoop, nominal
 from benchmarks.loop.measures import measure
@@ -147,13 +148,16 @@ def reference_of(scenario: Scenario, runs: int, seed: int) -> Reference:
 
     Raises
     ------
-    ValueError
+    CommandError
         If the error of an idle valve in `scenario` is not above the reference error.
     """
     reference = reference_error(
         samples=scenario.samples, episodes=runs, seed=seed, **scenario.arguments
     )
     # Without scores, a case cannot be reported. So the method is called here, where a
-    # ValueError ends only the task of this case.
-    reference.score(0.0)
+    # refusal ends only the task of this case.
+    try:
+        reference.score(0.0)
+    except ValueError as error:
+        raise CommandError(str(error)) from error
     return reference

@@ -4,7 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, TypeVar
 
+from benchmarks.lib.command import CommandError
 from benchmarks.loop.linear import (
+    ROBUSTNESS,
+    SLOWEST_LOOP,
     LinearController,
     LinearModel,
     nominal,
@@ -13,11 +16,6 @@ from benchmarks.loop.linear import (
 )
 from mptc_gym import Parameters
 from mptc_gym.plant.signals import SetPointLevels
-
-# Maximum sensitivity Ms of the control loop, from which a controller's time constant is chosen.
-# The time constant of the tuning rule SIMC leads to an Ms of 1.56.
-ROBUSTNESS = 1.6
-
 
 Tuned = TypeVar("Tuned", bound=LinearController)
 
@@ -112,9 +110,12 @@ class KnownPlant:
         """
         # All useful time constants are between `fastest` and `slowest`, s.
         test = self.step_test
-        slowest = 30.0 * (test["time_constant"] + test["delay"])
+        slowest = SLOWEST_LOOP * (test["time_constant"] + test["delay"])
         fastest = 0.1 * test["sampling_interval"]
-        exact = time_constant_for(ROBUSTNESS, build, self.model, slowest, fastest)
+        try:
+            exact = time_constant_for(ROBUSTNESS, build, self.model, slowest, fastest)
+        except ValueError as error:  # The plant resonates too much for this controller.
+            raise CommandError(str(error)) from error
         return build(float(f"{exact:.4g}"))
 
 

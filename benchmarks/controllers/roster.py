@@ -19,8 +19,9 @@ from agents import (
 )
 from agents.networks import PRETRAINED
 from agents.pi import SEARCHED_GAINS
-from benchmarks.controllers.known_plant import ROBUSTNESS, KnownPlant
+from benchmarks.controllers.known_plant import KnownPlant
 from benchmarks.controllers.mpc import PredictiveController
+from benchmarks.loop.linear import ROBUSTNESS
 from benchmarks.loop.runs import Agent, IdleValve, Trajectory, make_plants, simulate
 from mptc_gym.plant.parameters import PAPER_WINDOWS
 

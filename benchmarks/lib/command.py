@@ -31,9 +31,15 @@ options: Callable[[type[Declared]], type[Declared]] = Parameter(name="*")
 # The extra of this project that installs a package, for packages that are not in `bench`.
 EXTRAS = {"ray": "ray"}
 
+
+def _whole(_: type, tokens: Sequence[Any]) -> int:
+    """Return the integer that a user typed. Cyclopts would round 2.5."""
+    return int(tokens[0].value)
+
+
 # Types of options.
-Count = PositiveInt
-Seed = NonNegativeInt
+Count = Annotated[PositiveInt, Parameter(converter=_whole)]
+Seed = Annotated[NonNegativeInt, Parameter(converter=_whole)]
 Names = Annotated[tuple[str, ...], Parameter(consume_multiple=True)]
 _OUT_HELP = "The folder to write to, new or empty (default: the next free one in results/)."
 Folder = Annotated[Path | None, Parameter(help=_OUT_HELP)]

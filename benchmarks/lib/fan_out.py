@@ -21,7 +21,9 @@ class Outcome(NamedTuple):
 
     task: str  # the name of the task
     result: Any  # what the task returned; None if the task failed
-    error: str  # traceback of a task that failed; "" after success
+    # "" after success; the message of a `CommandError`, by which a task refuses what the user
+    # asked for; or the traceback of another exception
+    error: str
 
 
 class Finished(NamedTuple):
@@ -130,6 +132,8 @@ def _attempt(name: str, task: Task) -> Outcome:
     """
     try:
         return Outcome(name, task(), "")
+    except CommandError as refusal:
+        return Outcome(name, None, str(refusal))
     except Exception:
         return Outcome(name, None, traceback.format_exc())
 
@@ -137,7 +141,8 @@ def _attempt(name: str, task: Task) -> Outcome:
 def _summary(failures: Mapping[str, str]) -> list[str]:
     """Return a line for each failed task, with its name and error, and the first traceback."""
     lines = [f"{name}: {text.splitlines()[-1]}" for name, text in failures.items()]
-    return [*lines, *list(failures.values())[:1]]
+    tracebacks = [text for text in failures.values() if "\n" in text]
+    return [*lines, *tracebacks[:1]]
 
 
 def with_progress_bar(items: Iterable[Item], title: str, total: int) -> Iterable[Item]:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import NDArray
 
+from agents import PIController
 from mptc_gym import Parameters
 from mptc_gym.plant.dynamics import DRIFT_INTERVAL, Dynamics
 from mptc_gym.plant.parameters import PLANT_NUMBERS, PlantNumbers, slowest_pole
@@ -30,6 +31,18 @@ LOAD_STEPS, LOAD_WALK = -2, -1
 # Smith's method reads the times at which a step response reaches these shares of its final
 # value. A lag with the time constant T reaches the two shares after T / 3 and T.
 EARLY_LEVEL, LATE_LEVEL = 0.283, 0.632
+ROUNDING = 1e-12  # largest rounding error of A(1), divided by the sum of the magnitudes of A
+# Maximum sensitivity Ms of the control loop, from which a controller's time constant is chosen.
+# The time constant of the tuning rule SIMC leads to an Ms of 1.56.
+ROBUSTNESS = 1.6
+# Largest closed-loop time constant that a tuning rule tries, divided by the sum of the plant's
+# time constant and delay.
+SLOWEST_LOOP = 30.0
+# Largest half period of the set point that `unfit` considers, half of the longest run, samples.
+LONGEST_HOLD = 600
+# Part of half a period of the set point that the delay and the time constant of a plant should
+# take. Those of the paper's plant take a tenth.
+FITTING_PART = 0.2
 # Largest magnitude of a plant's pole for which `step_test` does a step test. A step test of a
 # slower plant would be too long.
 SLOWEST_POLE = 1 - 1e-5
@@ -100,10 +113,13 @@ class LinearModel:
     def gain(self) -> Array:
         """Steady-state gain B(1) / A(1) of each plant or at each sample, degC per t/h.
 
-        The gain of an integrating plant is infinite.
+        The gain of an integrating plant is infinite, with the sign of B(1). A plant also counts
+        as integrating if A(1) is as small as a rounding error.
         """
+        at_1 = 1.0 - self.alpha.sum(axis=-1)
+        is_integrator = np.abs(at_1) < ROUNDING * (1.0 + np.abs(self.alpha).sum(axis=-1))
         with np.errstate(divide="ignore"):
-            return np.asarray(self.beta.sum(axis=-1) / (1.0 - self.alpha.sum(axis=-1)))
+            return np.asarray(self.beta.sum(axis=-1) / np.where(is_integrator, 0.0, at_1))
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -292,6 +308,53 @@ def step_test(parameters: Parameters) -> dict[str, float]:
         "delay": max(1, round(delay)) * interval,
         "sampling_interval": interval,
     }
+
+
+def unfit(parameters: Parameters) -> str:
+    """Return a sentence that says why a plant is not for these commands; "" if it is.
+
+    The commands tune controllers by a step test, and compare them with an idle valve in runs of
+    a fixed length. So the nominal plant needs a steady state, and must reach it within half a
+    period of the set point. A flow within the limits must bring the temperature nearer to a
+    constant set point.
+    """
+    plant = nominal(parameters)
+    polynomials = f"a={list(parameters.a)}, b={list(parameters.b)}"
+    if np.isinf(plant.gain):
+        return f"the plant integrates: its temperature has no steady state, got {polynomials}"
+    if plant.slowest_pole > SLOWEST_POLE:
+        return f"the plant is not stable, or too slow for a step test, got {polynomials}"
+    if plant.gain == 0.0:
+        return f"the gain of the plant is 0, got {polynomials}"
+    if plant.slowest_pole == 0.0:
+        return f"the plant is static: it has no time constant, got {polynomials}"
+    test = step_test(parameters)
+    interval = parameters.sampling_interval
+    samples = (test["time_constant"] + test["delay"]) / interval
+    half_period = min(parameters.setpoint_period // 2, LONGEST_HOLD)
+    if samples > half_period:
+        fitting = float(f"{interval * samples / (FITTING_PART * half_period):.2g}")
+        return (
+            f"the plant is too slow for a set point that changes every {half_period} samples: "
+            f"its delay and time constant are {samples:,.0f} samples of {interval:g} s "
+            f"together; use a sampling_interval of {fitting:g} s, with a, b, c and delay for "
+            "this interval"
+        )
+    slowest = SLOWEST_LOOP * (test["time_constant"] + test["delay"])
+    controller = PIController.simc(closed_loop_time_constant=slowest, **test)
+    if LinearLoop.of(controller, plant).sensitivity() > ROBUSTNESS:
+        return (
+            f"the plant resonates: no PI controller of a tuning rule gives the loop a maximum "
+            f"sensitivity Ms of {ROBUSTNESS:g} or less, got {polynomials}"
+        )
+    if isinstance(parameters.setpoint, float):
+        steady = np.array([parameters.u_min, parameters.u_max]) * plant.gain
+        if (steady * parameters.setpoint < 0.0).all():
+            return (
+                f"no flow from u_min={parameters.u_min:g} to u_max={parameters.u_max:g} t/h "
+                f"brings the temperature nearer to the set point of {parameters.setpoint:g} °C"
+            )
+    return ""
 
 
 def _time_of(level: float, response: Array) -> float:

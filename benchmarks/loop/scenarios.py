@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from benchmarks.lib.command import CommandError, Parameter, options
+from benchmarks.loop.linear import unfit
 from mptc_gym import PRESETS, Parameters
 from mptc_gym.plant.parameters import EPISODE_STEPS, INTERFACE
 
@@ -180,7 +181,7 @@ class PlantOptions:
         """Return the arguments of the environment that --preset, --plant and --set choose.
 
         A `CommandError` is raised if an argument is unknown or invalid, or not one of the
-        plant, or if the file cannot be read.
+        plant, if the plant is not for these commands, or if the file cannot be read.
         """
         arguments: Arguments = {}
         if self.preset:
@@ -199,9 +200,11 @@ class PlantOptions:
                 "has its own observations and actions"
             )
         try:
-            Parameters(**arguments)
+            reason = unfit(Parameters(**arguments))
         except (TypeError, ValueError) as error:  # A TypeError names an unknown argument.
             raise CommandError(f"--plant, --preset, --set: {error}") from error
+        if reason:
+            raise CommandError(f"--plant, --preset, --set: {reason}")
         return arguments
 
 

@@ -213,7 +213,8 @@ class Parameters(PlantNumbers[Number]):
         50.0,
         checks.positive,
         "degC",
-        "largest magnitude of a reading of the transmitter, which saturates there",
+        "largest magnitude of a reading of the transmitter, which saturates there, and so of a "
+        "set point",
     )
     reward: str = _argument(
         "quadratic", checks.reward, "", 'form of the reward: "quadratic" or "absolute"'
@@ -257,6 +258,10 @@ class Parameters(PlantNumbers[Number]):
             value = check(name, checks.to_python(getattr(self, name)))
             object.__setattr__(self, name, value)  # the dataclass is frozen
         self._check_actuator()
+        if self.largest_setpoint > self.temperature_span:
+            name = "setpoint_amplitude" if isinstance(self.setpoint, str) else "setpoint"
+            allowed = f"within +-temperature_span = {self.temperature_span:g}"
+            reject(name, getattr(self, name), allowed)
         if self.changes_time_constant:
             self._check_time_constant()
         if self.is_disturbed and abs(slowest_pole(self.a)) >= 1.0:
