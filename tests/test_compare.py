@@ -296,3 +296,26 @@ class TestCompare:
         assert max(map(len, lines)) <= 80
         assert lines[1].split() == ["controller", *headings.split()]
         assert len(lines) == 2 + 3 + 1
+
+    @pytest.mark.usefixtures("undrawn")
+    def test_a_plant_is_described_and_its_steps_are_in_the_report(self, compared, capsys):
+        out = compared("--set delay=10 --agents dahlin nn idle --scenarios constant --runs 2")
+        first, *_ = capsys.readouterr().out.splitlines()
+        assert first == (
+            "Plant: gain -0.682 °C per t/h, time constant 161 s, delay 88 s, dead zone 5 t/h, "
+            "limits -10 to 10 t/h, sampling interval 8 s"
+        )
+        page = " ".join((out / "report.md").read_text().split())
+        assert "| constant | Dahlin | 0 | 4.5 | 21.2 | 13 |" in page
+        assert re.search(r"\| constant \| NN \(1992\) \| \d+ \(\d+ to \d+\)", page)
+        assert re.search(r"\| constant \| idle valve \| 0 \| never ", page)
+        assert "no controller settles" not in page
+
+    @pytest.mark.usefixtures("undrawn")
+    def test_a_comparison_says_where_no_controller_settles(self, compared, capsys):
+        # The limits allow 3.4 degC; the set point is 5.
+        words = "--set u_max=5 --set u_min=-5 --set dead_zone=0"
+        out = compared(f"{words} --agents pi-simc smith --scenarios constant --runs 1")
+        for text in (capsys.readouterr().out, (out / "report.md").read_text()):
+            assert "In the case constant, no controller settles." in text
+            assert "In the case constant, all controllers are at a limit" in text

@@ -22,7 +22,7 @@ from benchmarks.lib.command import (
 )
 from benchmarks.lib.fan_out import FanOut
 from benchmarks.lib.outputs import new_folder, provenance_of
-from benchmarks.loop.linear import unfit
+from benchmarks.loop.linear import describe, unfit
 from benchmarks.loop.scenarios import (
     PRESET_SCENARIOS,
     SCENARIOS,
@@ -30,6 +30,7 @@ from benchmarks.loop.scenarios import (
     PlantOptions,
     Scenario,
 )
+from mptc_gym import Parameters
 from mptc_gym.evaluation import SEED
 
 _SCENARIOS_HELP = (
@@ -68,9 +69,10 @@ class Options:
 def work(options: Options) -> None:
     """Compare controllers, write the results, and print a table and the path of the report.
 
-    A user's own controllers are checked before the first task begins. If a task fails or the
-    user interrupts the comparison, the results of the controllers that have finished are
-    written before an error is raised.
+    If the user has chosen a plant, a line that describes the plant is printed first. A user's
+    own controllers are checked before the first task begins. If a task fails or the user
+    interrupts the comparison, the results of the controllers that have finished are written
+    before an error is raised.
     """
     from benchmarks.compare.cases import Result, reference_of, run_case
     from benchmarks.compare.report import write
@@ -90,6 +92,8 @@ def work(options: Options) -> None:
         scenarios={name: vars(scenario) for name, scenario in scenarios.items()},
     )
     folder = new_folder(options.out, folder_name, provenance)
+    if options.plant.name:
+        print(describe(Parameters(**options.plant.arguments())), flush=True)
     task_of_reference = {case: f"reference error of {case}" for case in scenarios}
     tasks: dict[str, Any] = {}
     for case, scenario in scenarios.items():

@@ -1,11 +1,12 @@
 """Write the tables, pictures and report of a comparison of controllers in scenarios."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from benchmarks.bounds.reference import Reference
@@ -16,6 +17,7 @@ from benchmarks.controllers.roster import ControllerSpec
 from benchmarks.lib.command import CommandError
 from benchmarks.lib.sections import Section, write_report
 from benchmarks.lib.statistics import Estimate
+from benchmarks.loop.runs import is_random
 from benchmarks.loop.scenarios import Scenario
 
 SCORE_TEXT = (
@@ -42,6 +44,13 @@ COSTS_TEXT = (
     "loop. Ms is given for linear controllers, with the nominal plant of the first case that "
     "has finished, without dead zone and limits."
 )
+STEPS_TEXT = (
+    "In the cases without random numbers, the table has the largest overshoot beyond a new set "
+    "point, in percent of the change; the longest time from a change until the error stays "
+    "within 5 % of the change; the integral of the time since the change times |e| (ITAE); and "
+    "the valve travel. Numbers are medians. If runs differ, the 10th and the 90th percentile "
+    "follow in parentheses."
+)
 CASES_TEXT = (
     "Each case is the environment MiddlePoint-v0 with the arguments in the last column; all "
     "other arguments have their default values. Figs are the figures of the paper by Cui and "
@@ -52,6 +61,13 @@ PICTURES_TEXT = (
     "controller of the case that knows a step test, PPO, and your own controllers. The file "
     "CASE.csv of a case has the temperature and the flow of all controllers."
 )
+# The columns of the table of step responses, and the measure and the format of each.
+STEP_COLUMNS = {
+    "overshoot (%)": ("overshoot", ".0f"),
+    "settling time (min)": ("settling_time", ".1f"),
+    "ITAE (°C min²)": ("itae", ".1f"),
+    "travel (t/h)": ("total_variation", ".0f"),
+}
 SCREEN_TEXT = "cases: error / reference error; score: 0 idle valve, 1 reference error"
 LONGEST_LABEL = 16  # largest number of characters of a controller's label on the screen
 
@@ -145,6 +161,7 @@ def write(
         labels = ", ".join(controllers[name].label for name in incomplete)
         missing = f"Scores over fewer cases, as results are missing: {labels}."
         note = f"{note} {missing}".strip()
+    note = " ".join(filter(None, [note, *doubts(comparison)]))
     page = sections(comparison, note)
     write_report(folder, "Comparison of controllers", page, provenance, error)
     path_text = f"The report, tables, data and pictures are in {folder}/"
@@ -158,6 +175,8 @@ def sections(comparison: Comparison, note: str) -> list[Section]:
     cases_text = [CASES_TEXT]
     if len(comparison.scores) > plots.MOST_PICTURED:
         cases_text.append(PICTURES_TEXT)
+    steps = steps_table(comparison)
+    steps_section = [Section("Step responses", [STEPS_TEXT], steps)] if len(steps) else []
     return [
         Section(
             "Ratios and scores",
@@ -165,6 +184,7 @@ def sections(comparison: Comparison, note: str) -> list[Section]:
             pd.concat([first_row, table])[table.columns].fillna(""),
             pictures={"scores.png": "The score of each controller, and its score in each case"},
         ),
+        *steps_section,
         Section("What each controller knows and costs", [COSTS_TEXT], costs_table(comparison)),
         Section(
             "Cases",
@@ -208,6 +228,52 @@ def reference_table(references: Mapping[str, Reference]) -> pd.DataFrame:
         mark = "†" if reference.is_bound else ""
         row[name] = f"{reference.value:.3f}{mark}"
     return pd.DataFrame([row])
+
+
+def doubts(comparison: Comparison) -> list[str]:
+    """Return sentences on cases in which no controller settles, or all are at a limit."""
+    sentences = []
+    for scenario in comparison.scenarios:
+        case_runs = comparison.runs[comparison.runs["scenario"] == scenario.name]
+        case_runs = case_runs[case_runs["agent"] != "idle"]
+        if case_runs.empty:
+            continue
+        medians = case_runs.groupby("agent")[["settling_time", "saturation_share"]].median()
+        if not is_random(scenario.parameters) and np.isinf(medians["settling_time"]).all():
+            sentences.append(f"In the case {scenario.name}, no controller settles.")
+        if (medians["saturation_share"] > 50.0).all():
+            sentences.append(
+                f"In the case {scenario.name}, all controllers are at a limit of the flow for "
+                "more than half of the run."
+            )
+    return sentences
+
+
+def steps_table(comparison: Comparison) -> pd.DataFrame:
+    """Return a table of texts with measures of step responses in cases without randomness."""
+    calm = [case.name for case in comparison.scenarios if not is_random(case.parameters)]
+    rows = []
+    for case in calm:
+        percentiles = summarise(comparison.runs[comparison.runs["scenario"] == case])
+        for agent in comparison.scores:
+            of_agent = percentiles[percentiles["agent"] == agent]
+            if of_agent.empty:  # The task has not finished.
+                continue
+            numbers = of_agent.set_index("metric").to_dict("index")
+            row = {"case": case, "controller": comparison.controllers[agent].label}
+            for column, (measure, form) in STEP_COLUMNS.items():
+                row[column] = percentiles_text(numbers[measure], form)
+            rows.append(row)
+    return pd.DataFrame(rows, columns=["case", "controller", *STEP_COLUMNS])
+
+
+def percentiles_text(numbers: Mapping[Hashable, Any], form: str) -> str:
+    """Return a median, with the 10th and the 90th percentile if they differ in the format."""
+    median, low, high = (
+        format(numbers[name], form) if math.isfinite(numbers[name]) else "never"
+        for name in ("median", "p10", "p90")
+    )
+    return median if low == high else f"{median} ({low} to {high})"
 
 
 def costs_table(comparison: Comparison) -> pd.DataFrame:

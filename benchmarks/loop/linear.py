@@ -310,6 +310,19 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     }
 
 
+def describe(parameters: Parameters) -> str:
+    """Return a line on a plant, with the numbers of a step test and of a data sheet."""
+    test = step_test(parameters)
+    low, high = parameters.range_of("dead_zone")
+    dead_zone = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return (
+        f"Plant: gain {test['gain']:.3g} °C per t/h, time constant "
+        f"{test['time_constant']:.3g} s, delay {test['delay']:.4g} s, dead zone {dead_zone} "
+        f"t/h, limits {parameters.u_min:g} to {parameters.u_max:g} t/h, "
+        f"sampling interval {parameters.sampling_interval:g} s"
+    )
+
+
 def unfit(parameters: Parameters) -> str:
     """Return a sentence that says why a plant is not for these commands; "" if it is.
 
