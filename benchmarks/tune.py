@@ -52,6 +52,10 @@ WITH_THE_SAME_GAINS = {
     "nn": ["nn"],
     "pi": ["pi", "pi-searched", "pi-simc"],
 }
+EDGE = 1.05  # ratio of a gain to the end of its interval, below which it lies at the edge
+# Standard deviation of the output in the noise that a calm plant gets, divided by the amplitude
+# of the set point.
+ADDED_NOISE = 0.1
 PAPER_NOISE = PRESETS["noisy"]["noise_variance"]  # noise variance R of the paper, degC^2
 # Arguments of the environment for a plant without noise and load disturbance.
 QUIET: Arguments = {
@@ -116,13 +120,13 @@ def work(options: Options) -> None:
         "gains": {gain: rows[0][gain] for gain in spans},
         "plant": plant,
         # A text for the column "prior knowledge" of the reports of `benchmarks.compare`.
-        "knows": "gains of a search on this plant",
+        "knows": f"gains of a search on {options.plant.name or 'the plant of the paper'}",
         "searched": f"{len(spans)} gains by {budget}",
     }
     write_json(folder / "gains.json", content)
     title = f"The best gains of {len(trials)} trials, on {FINAL_RUNS:,} new runs"
     table = pd.DataFrame(rows).map(lambda x: x if isinstance(x, str) else f"{x:.4g}")
-    best = Section(title, NOTES, table)
+    best = Section(title, [*NOTES, *at_edges(rows[0], spans)], table)
     write_report(folder, f"Gains: {ROSTER[name].label}", [best], provenance)
     show(best)
     words = ["--agent", f"my-{name}={folder}/gains.json", *options.plant.words]
@@ -170,6 +174,16 @@ def finals(
     return rows
 
 
+def at_edges(row: Mapping[str, Any], spans: Spans) -> list[str]:
+    """Return a sentence for each gain of a row that lies at an edge of its interval."""
+    return [
+        f"The best {gain} lies at the edge of the interval of the search, from {least:.3g} to "
+        f"{most:.3g}: a gain beyond it may be better."
+        for gain, (least, most) in spans.items()
+        if not EDGE * abs(least) < abs(row[gain]) < abs(most) / EDGE
+    ]
+
+
 def cases(plant: Arguments) -> dict[str, TuningCase]:
     """Return the cases of a search for gains on a plant, by name.
 
@@ -181,7 +195,7 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     For other plants, the set points are scaled in proportion to `setpoint_amplitude`, the
     lengths of the runs in proportion to `setpoint_period`, and the dead zone and the noise
     variance in proportion to the values of the plant. In the case "noise", even a plant without
-    noise gets some noise.
+    noise gets some noise: as much that it moves the output by a tenth of the amplitude.
     """
     known = KnownPlant(plant)
     # Factors that are 1 for the paper's plant.
@@ -189,8 +203,12 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     duration = known.parameters.setpoint_period / PAPER.parameters.setpoint_period
     dead_zone = known.dead_zone / PAPER.dead_zone
     noise = float(known.model.numbers.noise_variance) / PAPER_NOISE
-    if noise == 0.0:  # The noise variance is scaled with the square of temperature changes.
-        noise = (known.temperature_range / PAPER.temperature_range) ** 2
+    noise_variance = 0.4 * noise
+    if noise == 0.0:
+        noise_variance = 0.4  # as of the published search
+        if known.parameters != PAPER.parameters:
+            deviation = ADDED_NOISE * known.parameters.setpoint_amplitude
+            noise_variance = deviation**2 / known.model.noise_power
 
     def square(
         samples: int, first: int, level: float, period: int, **changes: float
@@ -199,7 +217,7 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
         arguments = {
             **plant,
             "setpoint": "square",
-            "setpoint_amplitude": level * amplitude,
+            "setpoint_amplitude": min(level * amplitude, known.parameters.temperature_span),
             "setpoint_period": max(2, 2 * round(period * duration / 2)),
             **changes,
         }
@@ -209,7 +227,7 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     return {
         "constant": TuningCase(round(600 * duration), 0, constant),
         "dead zone": square(1280, 0, 5.1, 640, dead_zone=6.5 * dead_zone),
-        "noise": square(1040, 0, 4.9, 520, noise_variance=0.4 * noise),
+        "noise": square(1040, 0, 4.9, 520, noise_variance=noise_variance),
         "learnt": square(2240, 1120, 5.2, 560),
         "learnt, slow": square(1920, 1280, 5.4, 640),
     }
@@ -245,8 +263,10 @@ def search(
     storage = JournalStorage(JournalFileBackend(str(folder / "trials.log")))
     study_name = json.dumps([name, plant])
     names = optuna.study.get_all_study_names(storage)
-    if names and study_name not in names:
-        raise CommandError(f"--out: {folder} has another search, {names[0]}")
+    if names:
+        if json.loads(names[0]) != json.loads(study_name):  # in any order of the arguments
+            raise CommandError(f"--out: {folder} has another search, {names[0]}")
+        study_name = names[0]
     study = optuna.create_study(storage=storage, study_name=study_name, load_if_exists=True)
     magnitudes: Any = {
         gain: optuna.distributions.FloatDistribution(abs(least), abs(most), log=True)

@@ -41,6 +41,27 @@ def test_cases_scale_with_the_plant():
     assert cases["noise"].arguments["noise_variance"] == pytest.approx(0.8)
 
 
+def test_the_noise_of_a_calm_plant_is_a_tenth_of_the_set_point_at_the_output():
+    assert tune.cases({})["noise"].arguments["noise_variance"] == 0.4  # of the published search
+    calm = {"a": [1.0, -0.9], "b": [20.0], "c": [1.0], "setpoint_amplitude": 2.0}
+    variance = tune.cases(calm)["noise"].arguments["noise_variance"]
+    assert variance / (1.0 - 0.9**2) == pytest.approx(0.2**2)
+
+
+def test_the_interval_of_kp_follows_from_the_delay():
+    lag_dominant = KnownPlant({"a": [1.0, -0.98], "b": [0.02], "delay": 0})
+    least, most = SPANS["pi"](lag_dominant)["kp"]
+    # SIMC: T / (2 K theta), of the other sign as u = -Kp e.
+    assert abs(least) < 25.0 < abs(most)
+
+
+def test_a_gain_at_an_edge_is_said():
+    spans = {"kp": (-0.1, -10.0), "ki": (0.1, 1.0)}
+    assert tune.at_edges({"kp": -1.0, "ki": 0.5}, spans) == []
+    (sentence,) = tune.at_edges({"kp": -9.9, "ki": 0.5}, spans)
+    assert sentence.startswith("The best kp lies at the edge")
+
+
 def test_no_control_pays_for_not_settling():
     idle = replace(ROSTER["pi"], arguments={"kp": 0.0, "ki": 0.0})
     scores = tune.score(idle, {}, 2, 0)
@@ -159,3 +180,10 @@ class TestSearch:
         stored = [tune.search("pi", {}, SPANS["pi"](PAPER), 6, out) for out in (whole, parts)]
         gains, same_gains = ([trial.params for trial in trials] for trials in stored)
         assert gains == same_gains
+
+    def test_the_order_of_the_arguments_of_a_plant_does_not_matter(self, tmp_path):
+        spans = SPANS["pi"](PAPER)
+        tune.search("pi", {"delay": 3, "dead_zone": 4.0}, spans, 1, tmp_path)
+        assert len(tune.search("pi", {"dead_zone": 4.0, "delay": 3}, spans, 1, tmp_path)) == 1
+        with pytest.raises(CommandError, match="has another search"):
+            tune.search("pi", {"dead_zone": 4.0, "delay": 2}, spans, 1, tmp_path)

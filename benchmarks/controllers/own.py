@@ -8,9 +8,10 @@ import importlib.util
 import inspect
 import json
 import pkgutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from agents import PolicyNetwork
 from benchmarks.controllers.known_plant import KnownPlant
@@ -97,10 +98,16 @@ def _with_trained_networks(files: Sequence[str]) -> ControllerSpec:
     return replace(
         ROSTER["ppo"],
         trainings=[str(Path(file).resolve()) for file in files],
-        knows="trained on a simulator of this plant",
+        knows=f"trained on a simulator of {_in_words(provenance.get('plant', {}))}",
         searched=f"trained by PPO: {samples}",
         direction=KnownPlant(provenance.get("plant", {})).direction,
     )
+
+
+def _in_words(plant: Mapping[str, Any]) -> str:
+    """Return the arguments of a plant as a text for a table."""
+    arguments = ", ".join(f"{name}={value}" for name, value in plant.items())
+    return f"the plant {arguments}" if arguments else "the plant of the paper"
 
 
 def from_factory(plant: KnownPlant, runs: int, seed: int, training: str) -> Made:

@@ -17,9 +17,12 @@ def pi_spans(plant: KnownPlant) -> Spans:
 
     A PI controller has a proportional gain `kp` in t/h per degC, and an integral gain `ki` in
     t/h per degC and sample. The interval of `kp` is inversely proportional to the gain of
-    `plant`, and the interval of `ki` to the product of gain and time constant.
+    `plant`, and proportional to the ratio of its time constant and its delay, as in the rule
+    SIMC. The interval of `ki` is proportional to that of `kp`, divided by the time constant.
     """
-    kp = PAPER.gain / plant.gain  # 1 for the paper's plant
+    # Both factors are 1 for the paper's plant.
+    slowness = (time_constant(plant) / lag(plant)) / (time_constant(PAPER) / lag(PAPER))
+    kp = PAPER.gain / plant.gain * slowness
     ki = kp * time_constant(PAPER) / time_constant(plant)  # 1 for the paper's plant
     return {"kp": (0.1 * kp, 10.0 * kp), "ki": (1e-3 * ki, 1.0 * ki)}
 
@@ -40,6 +43,11 @@ def nn_spans(plant: KnownPlant) -> Spans:
         "input_scale": (0.02 * scale, 1.0 * scale),
         "weight_scale": (0.05, 2.0),
     }
+
+
+def lag(plant: KnownPlant) -> float:
+    """Return the delay of a plant, samples, with the sample in which a flow first acts."""
+    return float(plant.model.numbers.delay) + 1.0
 
 
 def time_constant(plant: KnownPlant) -> float:

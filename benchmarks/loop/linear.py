@@ -31,6 +31,7 @@ LOAD_STEPS, LOAD_WALK = -2, -1
 # Smith's method reads the times at which a step response reaches these shares of its final
 # value. A lag with the time constant T reaches the two shares after T / 3 and T.
 EARLY_LEVEL, LATE_LEVEL = 0.283, 0.632
+DOUBLINGS = 22  # 2^22 samples are longer than any transient of a plant that `step_test` takes
 ROUNDING = 1e-12  # largest rounding error of A(1), divided by the sum of the magnitudes of A
 # Maximum sensitivity Ms of the control loop, from which a controller's time constant is chosen.
 # The time constant of the tuning rule SIMC leads to an Ms of 1.56.
@@ -120,6 +121,17 @@ class LinearModel:
         is_integrator = np.abs(at_1) < ROUNDING * (1.0 + np.abs(self.alpha).sum(axis=-1))
         with np.errstate(divide="ignore"):
             return np.asarray(self.beta.sum(axis=-1) / np.where(is_integrator, 0.0, at_1))
+
+    @property
+    def noise_power(self) -> float:
+        """Variance of the output of one stable plant in white noise xi with the variance 1."""
+        F, g = self.state_space()
+        P = np.outer(g, g)
+        power = F
+        for _ in range(DOUBLINGS):  # P is the sum of 2^i terms F^j g g' F'^j.
+            P = P + power @ P @ power.T
+            power = power @ power
+        return float(P[0, 0])
 
     @property
     def limits(self) -> tuple[float, float]:
