@@ -113,12 +113,6 @@ class Controller(ABC):
                 f"policy must have the flow limits of env, u_min={parameters.u_min}, "
                 f"u_max={parameters.u_max}, got {self.u_min}, {self.u_max}"
             )
-        interval = getattr(self, "sampling_interval", parameters.sampling_interval)
-        if interval != parameters.sampling_interval:
-            raise ValueError(
-                f"policy must have the sampling interval of env, "
-                f"sampling_interval={parameters.sampling_interval}, got {interval}"
-            )
         # An observation begins with the windows of set points and errors, each newest first.
         first = 0  # index of the signal's newest sample in the observation
         for signal in ("setpoint", "error"):

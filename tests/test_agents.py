@@ -404,12 +404,3 @@ def test_bad_arguments_are_named(make):
     for name, value in BAD[make]:
         with pytest.raises(ValueError, match=name):
             make(**{name: value})
-
-
-@pytest.mark.parametrize("cls", [SmithPredictor, DahlinController, SelfTuningController])
-def test_a_controller_for_another_sampling_interval_is_refused(cls):
-    arguments = {"closed_loop_time_constant": 80.0} if cls is not SelfTuningController else {}
-    controller = cls(**STEP_TEST, sampling_interval=8.0, **arguments)
-    with pytest.raises(ValueError, match=r"sampling_interval=1\.0, got 8\.0"):
-        controller.check_environment(Parameters(sampling_interval=1.0), 1)
-    controller.check_environment(Parameters(sampling_interval=8.0), 1)
