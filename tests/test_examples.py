@@ -155,6 +155,7 @@ def test_a_bump_test_gives_the_plant_that_made_it(flow_before, tmp_path, capsys)
         (lambda log: log.replace({"time": {140.0: "noon"}}), 1.5, "could not convert.*noon"),
         (lambda log: log.replace({"flow": {1.4: np.nan}}), 1.5, "a number in each row"),
         (lambda log: log.drop(10), 1.5, "from 4 s to 8 s apart, the latter after 136 s"),
+        (lambda log: log[::-1], 1.5, "times must ascend"),
         (lambda log: log.assign(flow=log.flow.clip(-1, 1)), 1.5, "outside the dead zone"),
         (lambda log: log.assign(flow=9.0 * (log.time > 400)), 1.5, "move twice or more"),
         (lambda log: log, -1.5, "dead_zone must be"),
@@ -167,3 +168,47 @@ def test_a_log_that_cannot_be_fitted_is_refused(change, dead_zone, message, tmp_
         fit_plant.main(
             log, tmp_path / "plant.json", dead_zone=dead_zone, u_min=-20.0, u_max=30.0
         )
+
+
+def test_a_log_with_decimal_commas_is_refused(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("time,flow,temperature\n0,1,5,20,1\n8,1,5,20,2\n")
+    with pytest.raises(SystemExit, match="row 2 has more columns than the headings"):
+        fit_plant.main(log, tmp_path / "plant.json", dead_zone=0.0, u_min=-1.0, u_max=1.0)
+
+
+# Plants that SciPy simulates: with an offset, with a second lag, sampled each second, in kg/h.
+@pytest.mark.parametrize(
+    ("gain", "time_constant", "delay", "interval", "offset", "move", "lag"),
+    [
+        (2.0, 50.0, 10, 5.0, 0.0, 1.0, 0.0),
+        (-0.5, 300.0, 25, 8.0, 480.0, 10.0, 0.0),
+        (1.5, 20.0, 6, 1.0, 300.0, 2.0, 2.0),
+        (-4e-4, 120.0, 12, 4.0, 753.0, 5000.0, 5.0),  # K per kg/h
+        (0.8, 90.0, 0, 2.0, -20.0, 3.0, 0.0),
+    ],
+)
+def test_logs_of_plants_by_scipy(
+    gain, time_constant, delay, interval, offset, move, lag, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(pd.DataFrame, "plot", lambda *_, **__: [plt.figure().add_subplot()])
+    flow = move * np.repeat([0.5, 1.0, -0.5, 0.3], 200)
+    times = interval * np.arange(len(flow))
+    delayed = np.r_[np.full(delay, flow[0]), flow][: len(flow)] - flow[0]
+    plant = signal.lti([gain], np.polymul([time_constant, 1.0], [lag, 1.0]))
+    rise = signal.lsim(plant, delayed, times, interp=False)[1]
+    noise = np.random.default_rng(1).normal(0.0, 0.003 * abs(gain) * move, len(flow))
+    log, file = tmp_path / "log.csv", tmp_path / "plant.json"
+    table = {"time": times, "flow": flow, "temperature": offset + rise + noise}
+    pd.DataFrame(table).to_csv(log, index=False)
+    fit_plant.main(log, file, dead_zone=0.0, u_min=-2.0 * move, u_max=2.0 * move)
+    plt.close("all")
+    found = json.loads(file.read_text())
+    pole = -found["a"][1]
+    assert found["b"][0] / (1.0 - pole) == pytest.approx(gain, rel=0.05)
+    assert -interval / np.log(pole) == pytest.approx(time_constant, rel=0.15)
+    # A second lag acts as a delay.
+    assert found["delay"] * interval == pytest.approx(
+        delay * interval + lag, abs=1.5 * interval
+    )
+    assert found["temperature_span"] >= 2.0 * abs(gain) * move

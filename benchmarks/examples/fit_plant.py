@@ -19,6 +19,7 @@ the limits, as in equation (29)::
     temperature(k) = offset + y(k)
 """
 
+import csv
 import json
 from pathlib import Path
 
@@ -40,7 +41,13 @@ LONGEST_DELAY = 200
 
 
 def read_log(file: Path) -> pd.DataFrame:
-    """Return a log, or exit with a message if numbers are missing or times not equidistant."""
+    """Return a log, or exit with a message that says why it cannot be fitted."""
+    with file.open(encoding="utf-8", newline="") as lines:
+        lengths = [len(row) for row in csv.reader(lines)]
+    if max(lengths, default=0) > lengths[0]:  # as with decimal commas
+        raise SystemExit(
+            f"{file}: row {lengths.index(max(lengths)) + 1} has more columns than the headings"
+        )
     try:
         log = pd.read_csv(
             file, usecols=["time", "flow", "temperature"], dtype=float, na_filter=False
@@ -51,6 +58,8 @@ def read_log(file: Path) -> pd.DataFrame:
             f"with a number in each row: {error}"
         ) from error
     intervals = np.diff(log.time)
+    if (intervals <= 0.0).any():
+        raise SystemExit(f"{file}: times must ascend, so the oldest row must be the first")
     if np.ptp(intervals) > 0.1 * np.median(intervals):
         raise SystemExit(
             f"{file}: times must be equidistant, but are from {intervals.min():g} s to "
@@ -133,6 +142,8 @@ def main(
     temperature = log.temperature.to_numpy()
     delay, pole = fit_lag(applied, temperature)
     (gain, change, level), errors = regress(applied, temperature, delay, pole)
+    # The largest steady change of the temperature within the limits of the flow fits into it.
+    span = float(f"{2.0 * abs(gain) * max(abs(u_min), abs(u_max)):.2g}")
     plant = {
         "a": [1.0, -pole],
         "b": [gain * (1.0 - pole)],
@@ -142,6 +153,7 @@ def main(
         "u_min": u_min,
         "u_max": u_max,
         "sampling_interval": interval,
+        "temperature_span": max(span, float(np.ptp(temperature))),
     }
     plant_file.write_text(json.dumps(plant, indent=1))
     signals = {
@@ -156,6 +168,8 @@ def main(
         drawstyle="steps-post",
     )
     panels[0].figure.savefig(plant_file.with_suffix(".png"))
+    if delay >= min(LONGEST_DELAY, len(log) // 2 - 1):
+        print("The delay is the longest that the fit tries: the plant's delay may be longer.")
     print(
         f"gain {gain:.4g} degC per t/h, time constant {-interval / np.log(pole):.4g} s, delay "
         f"{delay} samples of {interval:g} s, temperature at flow 0 {level + change:.4g} degC\n"
