@@ -115,13 +115,13 @@ class DirectNNController(Controller):
 
     Notes
     -----
-    With the default learning rates, the controller is good for runs of about 2,400 samples (5
-    hours), and in noise for 1,200. Nothing bounds the weights: in continuous operation they
-    grow, the error rises after three to five hours, and after about a day, in noise after eight
-    hours, the controller is no better than the paper's PI controller. Smaller learning rates,
-    or a larger `update_interval`, only postpone the growth, and the controller learns more
-    slowly in proportion. To stop it, set `learning` to False once the controller has learnt;
-    the weights then no longer follow a plant that changes.
+    The default learning rates are good for about 2,400 samples (5 hours), and in noise for
+    1,200. Nothing bounds the weights of a network that never stops learning. On the square
+    wave, the error rises after three to five hours, and within a day, in noise within eight
+    hours, it is that of the paper's PI controller. Smaller learning rates, or a larger
+    `update_interval`, postpone both: the network learns later and is ruined later, in
+    proportion. If `learning` is set to False once the network has learnt, the weights stay as
+    they are, but no longer follow a plant that changes.
 
     Examples
     --------

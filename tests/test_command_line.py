@@ -50,7 +50,7 @@ def test_help_imports_nothing_heavy():
 
 
 REFUSED = {
-    "claims": [(["everything"], "no 'everything'")],
+    "claims": [(["--draws", "0"], "Must be > 0")],
     "compare": [
         (["--agents", "nn", "pie"], "--agents: there is no 'pie'; choose from idle, nn, "),
         (["--agent", "mine=none.json"], "No such file or directory: 'none.json'"),

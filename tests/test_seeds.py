@@ -6,7 +6,7 @@ import json
 import pytest
 
 from benchmarks import tune
-from benchmarks.claims.runs import Batch
+from benchmarks.claims import __main__ as claims
 from benchmarks.lib.seeds import SEEDS
 from benchmarks.train import __main__ as train
 from mptc_gym import evaluation
@@ -29,7 +29,7 @@ def test_every_command_stays_in_its_block():
     trials = [tune.FIRST_RUN + i * 100_000 for i in range(len(tune.cases({})))]
     finals = [seed - tune.FIRST_RUN + tune.FINAL_FIRST_RUN for seed in trials]
     for name, seeds in {
-        "studies": [Batch(1000).seed + 1000 - 1],
+        "claims": [claims.SEED, claims.SEED + claims.RUNS * claims.Options().draws - 1],
         "networks": [train.SEED, train.SEED + 5 - 1],
         "sampler": [tune.SEED, tune.SEED + 800 - 1],
         "preparation": [*trials, trials[-1] + 100 - 1],

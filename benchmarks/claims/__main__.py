@@ -1,51 +1,98 @@
-"""Test the paper's claims: `python -m benchmarks.claims --help`."""
+"""Judge the paper's claims: `python -m benchmarks.claims --help`."""
 
 from dataclasses import dataclass, field
 from functools import partial
 
-from benchmarks.lib.command import Count, Folder, Names, choose, command, options
-from benchmarks.lib.fan_out import FanOut
+from benchmarks.lib.command import Count, Folder, command, options
+from benchmarks.lib.fan_out import FanOut, Task
 from benchmarks.lib.outputs import new_folder, provenance_of
+from benchmarks.lib.seeds import SEEDS
+
+SEED = SEEDS["claims"].start  # seed of the random settings, and of the first run
+RUNS = 20  # number of runs of each setting that is drawn
+LEVEL_RUNS = 100  # number of runs of each named setting at a level other than `PAPER_LEVEL`
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Test the paper's claims, each on a thousand runs.
+    """Judge the paper's claims in many settings of the numbers that the paper leaves open.
 
-    The verdicts on the claims are written to report.md, and all numbers to claims.csv.
+    The shares of settings in which the claims hold are written to report.md, all settings with
+    their numbers to claims.csv, and the errors of ten days of operation to life.csv.
     """
 
-    claims: Names = field(default=(), kw_only=False)
-    """Claims to test (default: all)."""
+    draws: Count = 300
+    """The number of random settings."""
     runs: Count = 1000
-    """The number of runs of each case."""
+    """The number of runs of each of the two settings that have names."""
+    days: Count = 10
+    """The length of the continuous operation, days."""
     fan_out: FanOut = field(default_factory=FanOut)
     out: Folder = None
 
 
 def work(options: Options) -> None:
-    """Test claims of the paper, write a report on those that could be tested, and print it."""
-    from benchmarks.claims.claims import CLAIMS, examined
-    from benchmarks.claims.findings import sections, table
-    from benchmarks.claims.runs import Batch
+    """Judge all claims, write the report, the tables and the pictures, and print the shares."""
+    import pandas as pd
+
+    from benchmarks.claims import conditions, life, pictures
+    from benchmarks.claims.claims import judge
+    from benchmarks.claims.settings import (
+        NAMED_LEVELS,
+        PAPER_LEVEL,
+        Batch,
+        draw_settings,
+        named,
+    )
+    from benchmarks.claims.tables import sections
     from benchmarks.lib.sections import show, write_report
 
-    chosen = choose("CLAIM", options.claims or list(CLAIMS), CLAIMS)
-    batch = Batch(options.runs)
-    provenance = provenance_of(seeds={"first": batch.seed, "runs": batch.runs})
+    provenance = provenance_of(seeds={"first": SEED, "draws": options.draws})
     folder = new_folder(options.out, "claims", provenance)
-    # The tests of the last claims take longest, so these tests start first.
-    tasks = {name: partial(examined, name, batch) for name in reversed(chosen)}
+    settings = draw_settings(options.draws, SEED)
+    drawn = {}
+    for level in sorted(set(settings["level"].tolist())):
+        of_level = settings[settings["level"] == level]
+        drawn[level] = Batch(of_level, level, RUNS, SEED + RUNS * int(of_level.index[0]))
+    chosen = {level: Batch(named(), level, LEVEL_RUNS, SEED) for level in NAMED_LEVELS}
+    chosen[PAPER_LEVEL] = Batch(named(), PAPER_LEVEL, options.runs, SEED)
+
+    # The tasks that take longest start first.
+    tasks: dict[str, Task] = {
+        f"life, {plant}": partial(life.operate, plant, options.days, SEED)
+        for plant in conditions.PLANTS
+    }
+    for kind, batches in (("named", chosen), ("drawn", drawn)):
+        for level, batch in batches.items():
+            for part, measure in conditions.PARTS.items():
+                is_needed = kind == "drawn" or level == PAPER_LEVEL
+                if is_needed or part in conditions.REPORTED_PARTS:
+                    tasks[f"{kind}, {level:.2f}, {part}"] = partial(measure, batch)
     finished = options.fan_out.run(tasks, "claims")
-    numbers = table(CLAIMS, dict(reversed(finished.results.items())))
-    report = sections(CLAIMS, numbers)
-    numbers.to_csv(folder / "claims.csv", index=False)
-    write_report(folder, "The paper's claims", report, provenance, finished.error)
-    show(report[0])
-    print(f"All numbers are in {folder}/report.md and claims.csv")
     if finished.error:
         raise finished.error
+
+    def measured(kind: str, level: float) -> dict[str, conditions.Measured]:
+        """Return what was measured at a level, by the set point."""
+        of_setpoints: dict[str, conditions.Measured] = {"constant": {}, "square": {}}
+        for part in conditions.PARTS:
+            setpoint, *_ = part.split()
+            of_setpoints[setpoint] |= finished.results.get(f"{kind}, {level:.2f}, {part}", {})
+        return of_setpoints
+
+    verdicts = pd.concat([judge(measured("drawn", level)) for level in drawn])
+    draws = settings.join(verdicts.set_axis(settings.index))
+    operation = pd.concat([finished.results[f"life, {plant}"] for plant in conditions.PLANTS])
+    by_level = {level: measured("named", level) for level in chosen}
+    report = sections(draws, by_level, life.summarise(operation))
+    draws.to_csv(folder / "claims.csv", index_label="draw", float_format="%.4g")
+    operation.to_csv(folder / "life.csv", index=False, float_format="%.4g")
+    pictures.draw_figures(folder)
+    pictures.draw_life(operation, folder / "life.png")
+    write_report(folder, "The paper's claims", report, provenance)
+    show(report[0])
+    print(f"All criteria and pictures are in {folder}/report.md, all settings in claims.csv")
 
 
 main = command("claims", Options, work)

@@ -1,160 +1,325 @@
-"""List the paper's claims in words, each with the function that examines the claim.
+"""List the paper's claims with their criteria, and judge settings by the criteria.
 
 The paper is that of Cui and Shin (1992), whose controller is a neural network (NN) that learns
 online.
 """
 
-from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from math import inf
+from typing import Any
 
-from agents.pi import SEARCHED_GAINS
-from benchmarks.claims import examinations
-from benchmarks.claims.examinations import PAPER_PI, Findings
-from benchmarks.claims.findings import Finding
-from benchmarks.claims.runs import Batch
+import numpy as np
+import pandas as pd
+
+from benchmarks.claims.conditions import CHANGED_PLANTS, OTHER_PLANTS, PLANTS, Measured
+from benchmarks.claims.settings import Array
+
+# Limits that give words of the claims a meaning, the same for all claims.
+NOTABLE = 0.1  # A relative change of an error is "notable" from this share on.
+LARGE = 0.5  # "much better", "seriously worse": the error changes by at least this share.
+MOST = 90.0  # percentage of the runs that counts as most runs
+
+BOTH = "constant", "square"
 
 
-class Claim(NamedTuple):
-    """A claim of the paper, with the function that examines the claim."""
+@dataclass(frozen=True)
+class Criterion:
+    """A number of a setting, and the values of the number that a claim allows.
 
+    If `at_least` and `at_most` are infinite, the number is for information only.
+    """
+
+    quantity: str  # name of the number in reports
+    value: Callable[[Measured], Array]  # from what was measured to the number of each setting
+    at_least: float = -inf
+    at_most: float = inf
+
+    @property
+    def limit(self) -> str:
+        """The allowed values in words; "" for a number that is for information only."""
+        bounds = {"at least": self.at_least, "at most": self.at_most}
+        return " and ".join(f"{name} {x:.4g}" for name, x in bounds.items() if np.isfinite(x))
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of the paper, which holds in a setting if the setting meets all criteria."""
+
+    statement: str
     section: str  # where the claim is in the paper
-    statement: str  # the claim in one sentence
-    method: str  # how the claim is examined, and what its words mean, for the report
-    examine: Callable[[Batch], Findings]  # function that returns the findings from a batch
+    criteria: tuple[Criterion, ...]
+    setpoints: tuple[str, ...] = BOTH  # set points under which the claim is judged
+    is_reported: bool = False  # whether Section 5 of the paper reports this as a result
+
+
+def share(name: str) -> Callable[[Measured], Array]:
+    """Return a function that returns the percentage of the runs in which something happened."""
+    return lambda measured: 100.0 * measured[name].mean(axis=-1)
+
+
+def ratio(name: str, divisor: str) -> Callable[[Measured], Array]:
+    """Return a function that returns the median of one quantity divided by that of another."""
+    return lambda measured: _median(measured[name]) / _median(measured[divisor])
+
+
+def median(name: str) -> Callable[[Measured], Array]:
+    """Return a function that returns the median of a quantity over the runs."""
+    return lambda measured: _median(measured[name])
+
+
+def _median(values: Array) -> Array:
+    """Return the medians over the runs, shape (settings,)."""
+    return np.asarray(np.median(values, axis=-1))
+
+
+def _against_pi(name: str) -> tuple[Criterion, ...]:
+    """Return the criteria of a comparison with the paper's PI controller, by its name."""
+    quantity = "avoidable error / that of the PI controller"
+    return (
+        Criterion(quantity, ratio("error, plain", f"error, {name}"), at_most=1 - LARGE),
+        Criterion(
+            f"{quantity}, R = 0.5",
+            ratio("error, noise", f"error, {name}, noise"),
+            at_most=1 - LARGE,
+        ),
+    )
+
+
+def _pi_gains(name: str) -> tuple[Criterion, ...]:
+    """Return the criteria of what the paper says of its PI controller, by its name."""
+    return (
+        Criterion("peak to peak / set point", median(f"swing, {name}"), at_least=0.1),
+        Criterion(
+            "avoidable error with the best lower Kp / that with Kp = 2.2",
+            median(f"error of the best lower Kp, {name}"),
+            at_least=1 - NOTABLE,
+        ),
+        Criterion("largest pole, twice Kp", median(f"pole, twice Kp, {name}"), at_least=1.0),
+        Criterion(
+            "largest pole, twice Kp / largest pole, Kp",
+            ratio(f"pole, twice Kp, {name}", f"pole, {name}"),
+            at_least=1.0,
+        ),
+        Criterion("largest pole, Kp", median(f"pole, {name}")),
+    )
+
+
+def _no_better(shapes: Iterable[str]) -> tuple[Criterion, ...]:
+    """Return the criteria of larger networks, with the same rates for information."""
+    criteria = []
+    for shape in shapes:
+        for rates, at_least in (("", 1 - NOTABLE), (", same rates", -inf)):
+            criteria.append(
+                Criterion(
+                    f"avoidable error, {shape}{rates} / that of the paper's network",
+                    ratio(f"error, {shape}{rates}", "error, plain"),
+                    at_least=at_least,
+                )
+            )
+    return tuple(criteria)
+
+
+def _keep_updating() -> tuple[Criterion, ...]:
+    """Return the criteria of networks that go on learning, against frozen networks."""
+    return tuple(
+        Criterion(
+            f"avoidable error, {updates} / frozen, {plant}",
+            ratio(f"error, {plant}, {updates}", f"error, {plant}, frozen"),
+            at_most=1 - NOTABLE if updates == "learning" else inf,
+        )
+        for updates in ("learning", "every 2nd sample", "every 5th sample")
+        for plant in CHANGED_PLANTS
+    )
+
+
+def _reliable() -> tuple[Criterion, ...]:
+    """Return the criteria of networks in which a hidden node fails."""
+    criteria = []
+    for rates, at_most in (("", 1 - NOTABLE), (", same rates", inf)):
+        for stuck_at in (0, 1):
+            case = f"one stuck at {stuck_at}"
+            criteria.append(
+                Criterion(
+                    f"error after the failure, 6 nodes{rates} / 3 nodes, {case}",
+                    ratio(f"error, 6 nodes, {case}{rates}", f"error, 3 nodes, {case}"),
+                    at_most=at_most,
+                )
+            )
+    return tuple(criteria)
 
 
 CLAIMS = {
     "convergence": Claim(
+        "The weights converge within 150 samples",
         "Section 5, result 1",
-        "The weights converge within 150 sampling intervals",
-        "The weights have converged when their distance to their final values stays below 5 "
-        "% of the distance at the start of the run, for at least the last 100 samples of the "
-        "run.",
-        examinations.convergence,
+        (Criterion("weights converged at sample 150, % of runs", share("converged"), MOST),),
+        is_reported=True,
     ),
     "dead-zone": Claim(
+        "A dead zone of 7 t/h costs seriously, and the NN still works",
         "Section 5, result 2",
-        "A dead zone of 7 t/h costs performance seriously, and the NN still works well",
-        "A run has settled if the error stays within 5 % of the set point over the last 50 "
-        "samples. A dead zone of 7 t/h costs performance seriously if the mean error is at "
-        "least a fifth larger than with the paper's usual dead zone of 5 t/h. Both dead zones "
-        "are half widths.",
-        examinations.dead_zone,
+        (
+            Criterion(
+                "settled, dead zone 7, % of runs", share("settled, dead zone 7"), at_least=MOST
+            ),
+            Criterion(
+                "avoidable error, dead zone 7 / dead zone 5",
+                ratio("error, dead zone 7", "error, plain"),
+                at_least=1 + LARGE,
+            ),
+        ),
+        is_reported=True,
     ),
     "noise": Claim(
+        "The NN works with noise, R = 0.5",
         "Section 5, result 3",
-        "The NN works with noise, R = 0.5, without special consideration for it",
-        "R is the variance of the noise, °C². The NN works if three criteria are met: the "
-        "average error is at most 5 % of the set point, the temperature varies at most a fifth "
-        "more than without control, and the mean error is smaller than without control.",
-        examinations.noise,
+        (
+            Criterion("settled without noise, % of runs", share("settled, plain"), MOST),
+            Criterion(
+                "avoidable error, R = 0.5 / without noise",
+                ratio("error, noise", "error, plain"),
+                at_most=1 + NOTABLE,
+            ),
+        ),
+        is_reported=True,
     ),
-    "pi-gains": Claim(
-        "Section 5, after Fig. 10",
-        "The paper's PI controller oscillates; a lower Kp brings no notable improvement, a "
-        "higher one instability",
-        "The paper's PI controller has the proportional gain Kp = 2.2 and the integral gain "
-        "Ki = 0.3. The temperature y oscillates if it varies by at least 10 % of the set "
-        "point, peak to peak, over the last 300 samples. The lower gains are Kp from 0.1 to "
-        "2.2, and an improvement is notable if the mean error is at least 5 % smaller. The "
-        "higher gain is twice the paper's Kp.",
-        examinations.pi_gains,
-    ),
-    "nn-against-paper-pi": Claim(
+    "pi": Claim(
+        "The NN is much better than the paper's PI controller",
         "Section 5, Figs 5 and 10, 8 and 11",
-        "The NN is much better than the PI controller with the paper's gains",
-        f"The PI controller has the gains Kp = {PAPER_PI['kp']:g} and Ki = "
-        f"{PAPER_PI['ki']:g}. The NN is much better if its mean error is at least a fifth "
-        "smaller in the same noise.",
-        partial(examinations.against_pi, gains=PAPER_PI),
+        _against_pi("PI"),
+        is_reported=True,
     ),
-    "nn-against-searched-pi": Claim(
-        "Section 5, end of the comparison",
-        "No PI controller can perform well here: the NN is much better than one with searched "
-        "gains, too",
-        f"The PI controller has the gains Kp = {SEARCHED_GAINS['kp']:g} and Ki = "
-        f"{SEARCHED_GAINS['ki']:g}, which were searched with the same budget as the learning "
-        "rates of the NN. The NN is much better if its mean error is at least a fifth "
-        "smaller in the same noise.",
-        partial(examinations.against_pi, gains=SEARCHED_GAINS),
+    "pi-per-minute": Claim(
+        "The NN is much better than the paper's PI controller, Ki per minute",
+        "Section 5, Figs 5 and 10, 8 and 11",
+        _against_pi("PI per minute"),
     ),
-    "direction": Claim(
+    "wrong-direction": Claim(
+        "With -D(G), the training diverges at once",
         "Section 5, on (27)",
-        "Training with -D(G) diverges at once",
-        "D(G) is the sign of the plant's gain, so that -D(G) is the wrong sign. A run diverges "
-        "at once if the temperature exceeds, within 150 samples, 90 % of the largest deviation "
-        "that the flow can cause. According to the paper, the weights converge within 150 "
-        "samples if the network has the right sign.",
-        examinations.wrong_direction,
+        (
+            Criterion("diverged, % of runs", share("diverged, wrong sign"), at_least=MOST),
+            Criterion("diverged with the right sign, % of runs", share("diverged, plain")),
+        ),
+        is_reported=True,
     ),
     "six-nodes": Claim(
-        "Section 5, Fig. 12",
         "Six hidden nodes are no better than three",
-        "Six nodes are better if the mean error is at least 5 % smaller than with three nodes. "
-        "The gains are the learning rates of a network. Networks with six nodes run with the "
-        "gains of the paper's network ('the same gains'), and with half of these gains for the "
-        "weights and thresholds of hidden nodes ('gains in proportion').",
-        partial(examinations.other_shapes, shapes={"6 hidden nodes": {"nodes": 6}}),
+        "Section 5, Fig. 12",
+        _no_better(["6 nodes"]),
+        is_reported=True,
     ),
     "more-inputs": Claim(
+        "More delayed inputs are no better",
         "Section 5, on the choice of inputs",
-        "More delayed inputs are not superior",
-        "The paper's network observes the latest three set points and the latest three errors. "
-        "Here, networks observe the latest 6 or 20 values of each signal. More inputs are "
-        "superior if the mean error is at least 5 % smaller. The gains are the learning rates "
-        "of a network. The networks run with the gains of the paper's network ('the same "
-        "gains'), and with smaller gains for the weights of the inputs: half as large with 6 "
-        "values, and 3/20 as large with 20 values ('gains in proportion').",
-        partial(
-            examinations.other_shapes,
-            shapes={f"{n} set points and errors": {"length": n} for n in (6, 20)},
-        ),
+        _no_better(["6 inputs", "20 inputs"]),
+        is_reported=True,
     ),
     "reliability": Claim(
+        "More hidden nodes are more reliable",
         "Section 5, last sentence",
-        "More hidden nodes improve reliability",
-        "After 600 samples at a set point of 5 °C, one hidden node fails: its output stays at "
-        "0, or at 1, and the other nodes continue to learn. More nodes improve reliability if "
-        "the mean error after the failure is at least 5 % smaller than with three nodes. A run "
-        "has settled if the error stays within 5 % of the set point over 50 samples. The gains "
-        "are the learning rates of a network. The networks run with the gains of the paper's "
-        "network ('the same gains'), and with smaller gains for the weights and thresholds of "
-        "hidden nodes: half as large with six nodes, and a quarter as large with twelve nodes "
-        "('gains in proportion').",
-        examinations.reliability,
+        _reliable(),
+        ("constant",),
     ),
-    "keep-learning": Claim(
+    "keep-updating": Claim(
+        "On a plant that changes, the weights must keep being updated",
         "Section 4, last paragraph",
-        "On a plant that changes the weights must keep being updated",
-        "The network learns on the paper's plant for 1,200 samples of the square wave. Then "
-        "the gain or the delay (in samples) of the plant changes, and the network controls the "
-        "changed plant for 1,200 samples, from rest. In one run, the weights continue to "
-        "learn; in another run, the weights are frozen. Learning is necessary if the mean "
-        "error is at least 5 % smaller with learning weights than with frozen weights.",
-        examinations.keep_learning,
+        _keep_updating(),
+        ("square",),
     ),
     "direction-only": Claim(
+        "Only the direction of the response must be known",
         "Abstract and Section 6",
-        "The direction of the response is all that need be known of a plant",
-        "The direction is the sign of the plant's gain. The paper's network, with the learning "
-        "rates of the paper's plant, controls other plants with the same direction, whose "
-        "gains and time constants are multiples of those of the paper's plant. A run has "
-        "settled if the error stays within 5 % of the set point over the last 50 samples. The "
-        "network works on a plant if at least 90 % of the runs settle.",
-        examinations.direction_only,
+        tuple(
+            Criterion(f"settled, {plant}, % of runs", share(f"settled, {plant}"), MOST)
+            for plant in OTHER_PLANTS
+        ),
+        ("constant",),
     ),
-    "figures": Claim(
-        "Section 5, Figs 5 to 12",
-        "The curves of the figures themselves",
-        "The text of the paper does not say with which set points, gains, initial weights and "
-        "noise the curves were made. The following command draws the responses of both "
-        "controllers on the same plants: python -m benchmarks.compare",
-        lambda batch: (),
+    "searched-pi": Claim(
+        "After a day, the NN is better than PI (searched)",
+        "Section 5, end of the comparison",
+        tuple(
+            Criterion(
+                f"avoidable error, {time} 160 min of a day / that of PI (searched), {plant}",
+                ratio(f"error, {time}, {plant}, NN", f"error, {time}, {plant}, PI"),
+                at_most=1 - NOTABLE if time == "last" else inf,
+            )
+            for time in ("last", "first")
+            for plant in PLANTS
+        ),
+        ("square",),
+    ),
+    "day": Claim(
+        "The NN goes on working for a day",
+        "Section 4, last paragraph",
+        tuple(
+            Criterion(
+                f"mean error, last 160 min of a day / best 160 min, {plant}",
+                ratio(f"mean error, last, {plant}, NN", f"mean error, best, {plant}, NN"),
+                at_most=1 + NOTABLE,
+            )
+            for plant in PLANTS
+        ),
+        ("square",),
+    ),
+    "pi-gains": Claim(
+        "The paper's PI controller oscillates; a lower Kp is no better, a higher one unstable",
+        "Section 5, after Fig. 10",
+        _pi_gains("PI"),
+    ),
+    "pi-gains-per-minute": Claim(
+        "The same of the paper's PI controller, Ki per minute",
+        "Section 5, after Fig. 10",
+        _pi_gains("PI per minute"),
     ),
 }
+CONTROLS = Criterion("settled, % of runs", share("settled, plain"), at_least=MOST)
 
 
-def examined(name: str, batch: Batch) -> list[Finding]:
-    """Call the function that examines a claim, and return all findings about the claim."""
-    return list(CLAIMS[name].examine(batch))
+REPORTED = {name: claim for name, claim in CLAIMS.items() if claim.is_reported}
+
+
+def judge(
+    measured: Mapping[str, Measured], claims: Mapping[str, Claim] = CLAIMS
+) -> pd.DataFrame:
+    """Return all numbers of settings, and whether claims hold in the settings.
+
+    Parameters
+    ----------
+    measured
+        What was measured, by the set point, "constant" or "square".
+    claims
+        The claims to judge, by name.
+
+    Returns
+    -------
+    DataFrame
+        A row for each setting. The first column, "controls", says whether the network controls
+        at all: whether most runs settle at a constant set point without noise. A column "CLAIM,
+        SETPOINT" is 1 if the claim holds, 0 if not, and NaN if it cannot be judged: the flow
+        that the set point needs lies inside a dead zone. A column "CLAIM, SETPOINT: QUANTITY"
+        has the number of a criterion.
+    """
+    settles = CONTROLS.value(measured["constant"])
+    columns: dict[str, Any] = {"controls": _meets(CONTROLS, settles)}
+    for name, claim in claims.items():
+        for setpoint in claim.setpoints:
+            judged = f"{name}, {setpoint}"
+            columns[judged] = np.nan  # to be replaced; the verdict stands before the numbers
+            verdicts = []
+            for criterion in claim.criteria:
+                values = criterion.value(measured[setpoint])
+                columns[f"{judged}: {criterion.quantity}"] = values
+                if criterion.limit:
+                    verdicts.append(_meets(criterion, values))
+            # A criterion that cannot be judged does not count beside one that can.
+            columns[judged] = pd.DataFrame(verdicts).min().to_numpy()
+    return pd.DataFrame(columns)
+
+
+def _meets(criterion: Criterion, values: Array) -> Array:
+    """Return 1.0 where values meet a criterion, 0.0 where not, and NaN where they are NaN."""
+    is_met = (criterion.at_least <= values) & (values <= criterion.at_most)
+    return np.where(np.isnan(values), np.nan, is_met)

@@ -9,7 +9,7 @@ The seeds of commands and networks that are gone stay reserved, as earlier versi
 from mptc_gym import evaluation
 
 SEEDS = {
-    # Runs of claims and of commands that are gone.
+    # Runs of commands that are gone.
     "studies": range(10_000),
     # Initial weights of networks, and their training.
     "networks": range(10_000, 11_000),
@@ -17,6 +17,8 @@ SEEDS = {
     "sampler": range(1_000_000, 1_100_000),
     # Trials of a search.
     "preparation": range(3_000_000, 3_500_000),
+    # Random settings of the paper's network, and runs of claims.
+    "claims": range(3_500_000, 4_000_000),
     # Runs that choose among the best trials of a search.
     "finals": range(4_000_000, 4_500_000),
     # Episodes to choose policies by, with bounds in the package.

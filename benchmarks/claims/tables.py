@@ -1,0 +1,251 @@
+"""Lay out the verdicts on the paper's claims, as shares of settings, for the report."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.claims.claims import CLAIMS, REPORTED, Criterion, judge
+from benchmarks.claims.conditions import Measured
+from benchmarks.claims.life import VARIANTS
+from benchmarks.claims.settings import NAMED_SETTINGS, PAPER_LEVEL
+from benchmarks.lib.sections import Section
+from benchmarks.lib.statistics import Estimate, share
+
+# The words "yes", "no" or "undecided" by "CLAIM, SETPOINT", by the name of a setting.
+Verdicts = Mapping[str, Mapping[Any, str]]
+
+SETPOINTS = {"constant": "constant", "square": "square wave"}  # words in reports
+RESAMPLES = 200  # number of resamples of the runs of a named setting
+DECIDED = 0.95  # least share of the resamples that must agree with a verdict
+
+SHARES_NOTE = (
+    "The claims are those of the paper by Cui and Shin (1992). The NN is the paper's "
+    "controller, a neural network that learns online. The paper leaves six numbers of the NN "
+    "and the set points open. A setting is a random choice of these six numbers and of the "
+    "level of the set point. A setting controls at all if most runs settle at a constant set "
+    "point without noise. The first columns have the percentages of settings in which a claim "
+    "holds, with 95 % intervals, at a constant set point and on a square wave. The last two "
+    f"columns say whether the claim holds at {PAPER_LEVEL:g} °C, constant / square wave, with "
+    "the numbers of least error and with the one choice 'as reported'. A claim about the PI "
+    "controller alone depends on the level only. A dead zone of 7 t/h is judged at the levels "
+    "that can be held."
+)
+CRITERIA_NOTE = (
+    "A claim holds in a setting if the setting meets all criteria of the claim. Most runs are "
+    "90 %, notable is a tenth, and large is a half. A mean error is the mean of |e| over the "
+    "samples of a run, where e is the set point minus the temperature; an avoidable error is "
+    "the mean error minus the reference error of the same case. Errors are medians over the "
+    "runs. A number without a criterion is for information. The median and the percentiles are "
+    "over the settings that control at all. 'rates' are learning rates: larger networks have "
+    "rates in proportion, unless 'same rates' says otherwise."
+)
+
+
+LEVELS_NOTE = (
+    "The table has the number of the "
+    f"{len(REPORTED)} results of the paper's Section 5 that hold, by the level of the set "
+    "point: convergence, dead zone, noise, the paper's PI controller, direction, six nodes and "
+    "more inputs. At levels below 4.78 °C, a dead zone of 7 t/h cannot be judged, and does not "
+    "count."
+)
+LIFE_NOTE = (
+    "All controllers operate continuously on the square wave of 5 °C, without a restart. An "
+    "error is the mean of |e| over 160 min (1,200 samples), and the median over 40 runs. The "
+    "NN has the numbers of least error, with learning rates times 1, 0.3, 0.1 and 0.03. It has "
+    "learnt when its error is first within a tenth of its best, and is ruined when, after its "
+    "best, its error reaches 95 % of that of PI (1992). Weights are the largest magnitudes of "
+    "all weights and thresholds. Two variants are not the paper's, and show why the NN is "
+    "ruined: in one, weights stay within ±3; in the other, the learning rates fall in inverse "
+    "proportion to time from sample 600 on."
+)
+LIFE_PICTURE = {"life.png": "Error of continuous operation over days, for each plant"}
+FIGURES_NOTE = (
+    "The paper's figures 5 to 12 on the paper's plant with the seed 0: first with the numbers "
+    "'as reported' at a constant set point, then with those of least error on the square wave. "
+    "Figures 7 and 9 have the control input of the runs of figures 6 and 8, and figure 9 also "
+    "the noise n(k). Figures 8, 9 and 11 have the same noise."
+)
+FIGURES = {
+    "figures-constant.png": "Figures 5 to 12 at a constant set point",
+    "figures-square.png": "Figures 5 to 12 on the square wave",
+}
+
+
+def sections(
+    draws: pd.DataFrame, named: Mapping[float, Mapping[str, Measured]], life: pd.DataFrame
+) -> list[Section]:
+    """Return the sections of the report; the first has the shares of settings.
+
+    Parameters
+    ----------
+    draws
+        Settings that were drawn, and the columns that `judge` returns.
+    named
+        What was measured with the settings in `NAMED_SETTINGS`, a row for each, by the level of
+        the set point, degC, and by the set point. At the level `PAPER_LEVEL`, all claims can be
+        judged, and at the others those that the paper reports as results.
+    life
+        Table that `life.summarise` returns.
+    """
+    controlling = draws[draws["controls"] == 1.0]
+    verdicts = _verdicts(named[PAPER_LEVEL])
+    return [
+        Section("", [SHARES_NOTE, *_sentences(draws, verdicts)], _shares(draws, verdicts)),
+        Section("The paper's results by level of the set point", [LEVELS_NOTE], _levels(named)),
+        Section("How long the network lasts", [LIFE_NOTE], _life(life), LIFE_PICTURE),
+        Section("Figures 5 to 12", [FIGURES_NOTE], None, FIGURES),
+        Section(
+            "All criteria", [CRITERIA_NOTE], _criteria(controlling, judge(named[PAPER_LEVEL]))
+        ),
+    ]
+
+
+def _shares(draws: pd.DataFrame, verdicts: Verdicts) -> pd.DataFrame:
+    """Return a row for each claim: shares of settings, and verdicts in the named settings."""
+    groups = {"all": draws, "that control": draws[draws["controls"] == 1.0]}
+    rows = []
+    for name, claim in CLAIMS.items():
+        row = {"claim": claim.statement}
+        for setpoint, words in SETPOINTS.items():
+            for group, settings in groups.items():
+                row[f"{words}: {group} (%)"] = ""
+                if setpoint in claim.setpoints:
+                    estimate = _share_that_holds(settings, f"{name}, {setpoint}")
+                    row[f"{words}: {group} (%)"] = f"{estimate.scaled(100):.0f}"
+        for setting in NAMED_SETTINGS:
+            answers = [verdicts[setting][f"{name}, {setpoint}"] for setpoint in claim.setpoints]
+            row[setting] = " / ".join(answers)
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _share_that_holds(settings: pd.DataFrame, judged: str) -> Estimate:
+    """Return the share of the settings that can be judged in which a claim holds."""
+    holds = settings[judged].dropna().to_numpy() == 1.0
+    return share(holds) if len(holds) else Estimate(np.nan, 0.0, 1.0, 0)
+
+
+def _sentences(draws: pd.DataFrame, verdicts: Verdicts) -> list[str]:
+    """Return what the table of shares does not say: results together, and what is undecided."""
+    together = []
+    for setpoint, words in SETPOINTS.items():
+        count = _number_that_hold(draws, setpoint)
+        all_hold = int((count == len(REPORTED)).sum())
+        together.append(f"{words}, in {all_hold} settings (at most {count.max():.0f} in one)")
+    controlling = draws[draws["controls"] == 1.0]
+    unclear = []
+    open_verdicts = []
+    for name, claim in CLAIMS.items():
+        for setpoint in claim.setpoints:
+            estimate = _share_that_holds(controlling, f"{name}, {setpoint}")
+            words = f"{claim.statement!r} ({SETPOINTS[setpoint]})"
+            if estimate.low < 0.5 < estimate.high:
+                unclear.append(words)
+            for setting, verdicts_of_setting in verdicts.items():
+                if verdicts_of_setting[f"{name}, {setpoint}"] == "undecided":
+                    open_verdicts += [f"{words}, {setting}"]
+    controls = share((draws["controls"] == 1.0).to_numpy()).scaled(100)
+    return [
+        f"{len(draws)} settings were drawn, of which {len(controlling)} control at all: "
+        f"{controls:.0f} %. All {len(REPORTED)} results that the paper reports appear "
+        f"together: {'; '.join(together)}.",
+        "Undecided is whether more than half of the settings that control at all meet a claim: "
+        f"{'; '.join(unclear) or 'none'}. Undecided in a named setting: "
+        f"{'; '.join(open_verdicts) or 'none'}.",
+    ]
+
+
+def _number_that_hold(judged: pd.DataFrame, setpoint: str) -> "pd.Series[float]":
+    """Return how many of the results that the paper reports hold in each setting."""
+    return judged[[f"{name}, {setpoint}" for name in REPORTED]].sum(axis=1)
+
+
+def _verdicts(measured: Mapping[str, Measured]) -> Verdicts:
+    """Return the verdicts in the named settings, from what was measured in them.
+
+    A verdict is undecided if less than `DECIDED` of the resamples of the runs agree with it.
+    """
+    judged = [f"{name}, {sp}" for name, claim in CLAIMS.items() for sp in claim.setpoints]
+    verdicts = judge(measured)[judged]
+    generator = np.random.default_rng(0)
+    agreement = 0.0 * verdicts
+    for _ in range(RESAMPLES):
+        resampled = {}
+        for setpoint, quantities in measured.items():
+            runs = next(iter(quantities.values())).shape[-1]
+            which = generator.integers(runs, size=runs)
+            resampled[setpoint] = {name: x[:, which] for name, x in quantities.items()}
+        agreement += (judge(resampled)[judged] == verdicts) / RESAMPLES
+    words = verdicts.replace({1.0: "yes", 0.0: "no"}).where(agreement >= DECIDED, "undecided")
+    return dict(zip(NAMED_SETTINGS, words.to_dict("records"), strict=True))
+
+
+def _levels(named: Mapping[float, Mapping[str, Measured]]) -> pd.DataFrame:
+    """Return how many results of the paper hold in the named settings, by level."""
+    rows = []
+    for level, measured in sorted(named.items()):
+        judged = judge(measured, REPORTED)
+        counts = {words: _number_that_hold(judged, sp) for sp, words in SETPOINTS.items()}
+        row = {"level (°C)": f"{level:.2f}"}
+        for place, setting in enumerate(NAMED_SETTINGS):
+            for words, count in counts.items():
+                row[f"{setting}, {words}"] = f"{count[place]:.0f}"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _life(life: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of `life.summarise` as texts."""
+    table = life[["plant", "controller"]].copy()
+    for column in ("first", "best", "after a day", "last"):
+        table[f"{column} (°C)"] = life[column].map("{:.2f}".format)
+    for column in ("learnt", "ruined"):
+        times = life[column].map("{:.2f}".format)
+        is_network = life["controller"].isin([*VARIANTS])
+        never = is_network.map({True: "not yet", False: ""})
+        table[f"{column} (days)"] = times.where(life[column].notna(), never)
+    for column in ("weight after a day", "last weight"):
+        table[column] = life[column].map("{:.1f}".format).where(life[column].notna(), "")
+    return table
+
+
+def _criteria(controlling: pd.DataFrame, named: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each criterion: limits, numbers of settings and share that meets it."""
+    rows = []
+    for name, claim in CLAIMS.items():
+        for setpoint in claim.setpoints:
+            for criterion in claim.criteria:
+                column = f"{name}, {setpoint}: {criterion.quantity}"
+                values = controlling[column].dropna()
+                rows.append(
+                    {
+                        "claim": name,
+                        "number": criterion.quantity,
+                        "set point": SETPOINTS[setpoint],
+                        "asked": criterion.limit,
+                        "median (10 % to 90 %)": _percentiles(values),
+                        "meets (%)": _share_that_meets(criterion, values),
+                        **dict(zip(NAMED_SETTINGS, map(_digits, named[column]), strict=True)),
+                    }
+                )
+    return pd.DataFrame(rows)
+
+
+def _percentiles(values: "pd.Series[float]") -> str:
+    """Return the median of values over settings with the 10th and the 90th percentile."""
+    low, middle, high = (_digits(x) for x in values.quantile([0.1, 0.5, 0.9]))
+    return f"{middle} ({low} to {high})"
+
+
+def _share_that_meets(criterion: Criterion, values: "pd.Series[float]") -> str:
+    """Return the percentage of the values that meet a criterion; "" without a criterion."""
+    if not criterion.limit:
+        return ""
+    return f"{100 * values.between(criterion.at_least, criterion.at_most).mean():.0f}"
+
+
+def _digits(value: float) -> str:
+    """Return a number with as many decimals as its size asks for."""
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.3f}"
