@@ -105,6 +105,8 @@ def test_examples_of_the_pages_run(example, printed, monkeypatch, tmp_path, caps
         pygame = pytest.importorskip("pygame")
         closed = pygame.event.Event(pygame.QUIT)
         monkeypatch.setattr(pygame.event, "get", lambda: [closed])
+        # As it is imported, it asks for a window of Matplotlib, which it does not need.
+        monkeypatch.setattr(gymnasium.logger, "warn", lambda *_: None)
     # An example whose output is not on the page runs for a short time only.
     exec(example if printed else shortened(example), {})
     if printed:

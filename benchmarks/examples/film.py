@@ -18,12 +18,13 @@ from mptc_gym.rendering import TEMPERATURE, TEXT, WHITE, Panel
 ACTS = {0: "from the start", 12_000: "after 27 hours"}  # by the first sample of an act
 SAMPLES, STRIDE = 1200, 20  # of an act, and from one picture to the next
 SETPOINT = (150, 150, 150)  # wide and light, so that the film needs no colours
+PI_SIMC, _ = pi_simc(PAPER, 1, 0)  # and arguments of its environment, the defaults
 CONTROLLERS = {
     "Network of 1992: its 25 random weights learn as it controls": DirectNNController(
         num_envs=1
     ),
     "PI controller of 1992: two gains, from the paper": PIController(),
-    "PI controller (SIMC): two gains, by a rule from a step test": pi_simc(PAPER, 1, 0),
+    "PI controller (SIMC): two gains, by a rule from a step test": PI_SIMC,
 }
 
 
