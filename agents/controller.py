@@ -102,6 +102,8 @@ class Controller(ABC):
             If the controller does not fit the action form, the flow limits, the observations or
             the number of the plants.
         """
+        # A `PolicyNetwork` has the form of its actions as an argument; all other controllers
+        # set flows.
         action_form = getattr(self, "action", "flow")
         if parameters.action != action_form:
             raise ValueError(
@@ -114,6 +116,7 @@ class Controller(ABC):
                 f"u_max={parameters.u_max}, got {self.u_min}, {self.u_max}"
             )
         # An observation begins with the windows of set points and errors, each newest first.
+        # A `PolicyNetwork` has no such index, and checks all windows itself.
         first = 0  # index of the signal's newest sample in the observation
         for signal in ("setpoint", "error"):
             window = getattr(parameters, f"{signal}_window")
@@ -155,23 +158,25 @@ class Controller(ABC):
         values = np.asarray(observation, np.float64)
         if values.ndim not in (1, 2) or values.shape[-1] < self.n_obs or not len(values):
             raise ValueError(
-                f"observation must have shape (n_obs,) or (batch, n_obs), with n_obs of at "
-                f"least {self.n_obs}, got {values.shape}"
+                f"observation must have shape (size,) or (batch, size), with a size of at "
+                f"least {self.n_obs} and a batch of at least 1, got {values.shape}"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"observation must be finite, got {observation!r}")
         loop_shape = values.shape[:-1]
         if self._loop_shape not in (None, loop_shape):
             raise ValueError(
-                f"observation must have shape {(*self._loop_shape, self.n_obs)}, as the "
-                f"number of loops must not change before a reset, got {values.shape}"
+                f"observation must have shape {(*self._loop_shape, self.n_obs)}, or a longer "
+                f"last axis, as the number of loops must not change before a reset, got "
+                f"{values.shape}"
             )
+        # `_control` takes a batch, of one loop if need be, and updates the controller's memory.
         commands = self._control(np.atleast_2d(values))
         is_batch = loop_shape != ()
         self.command = commands if is_batch else commands[0]
         if self._remembers:
             self._loop_shape = loop_shape
-        return self._action(self.command)[..., np.newaxis]
+        return self._action(self.command)[..., np.newaxis]  # one element for each loop
 
     def _action(self, command: Values) -> NDArray[np.float32]:
         """Return the actions that command the flows `command`, t/h, in the same shape."""
@@ -181,7 +186,8 @@ class Controller(ABC):
     def _control(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the commands u(k), t/h, shape (loops,), and update the controller's memory.
 
-        `rows` are the observations of all loops at one sample, shape (loops, elements).
+        `rows` are the observations of all loops at one sample, float64, shape (loops,
+        elements).
         """
 
 
@@ -218,7 +224,7 @@ class ModelBasedController(Controller):
         self._check(nonzero, "gain")
         self._check(positive, "time_constant", "sampling_interval")
         self._check(not_negative, "delay", "dead_zone")
-        self._edge = self.dead_zone
+        self._edge = self.dead_zone  # for `_action`, as commands may be on the edge
 
     def check_environment(self, parameters: Parameters, n: int) -> None:
         """Raise a ValueError if the controller does not fit the plants of an environment.

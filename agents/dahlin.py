@@ -96,19 +96,21 @@ class DahlinController(InternalModelController):
             Coefficients of z^0, z^-1, z^-2 and so on in the numerator and in the denominator of
             the transfer function, as arrays.
         """
-        share = self._approach * self._filter
+        share = self._approach * self._filter  # g f
         numerator = share * np.array([1.0, -self._pole])
         lag = np.array([1.0, self._approach - 1.0])  # 1 - (1 - g) z^-1
         smoothed = np.convolve(lag, [1.0, self._filter - 1.0])  # times 1 - (1 - f) z^-1
-        in_transit = np.append(np.zeros(self._delay), share)
+        in_transit = np.append(np.zeros(self._delay), share)  # g f z^-(d+1)
         return numerator, self._input_gain * polysub(smoothed, in_transit)
 
     def _control(self, rows: Array) -> Array:
-        """Return the commands u(k), t/h, shape (loops,), and update the model's state."""
+        """Return the commands u(k), t/h, shape (loops,), and advance the model by a sample."""
         setpoint = rows[:, self.setpoint_index]
         output = setpoint - rows[:, self.error_index]
-        residual = output - self._delayed
+        residual = output - self._delayed  # y(k) - x(k-d)
         self._disturbance = self._disturbance + self._filter * (residual - self._disturbance)
-        state = self._undelayed
+        state = self._undelayed  # x(k)
         move = self._approach * (setpoint - self._disturbance - state)
-        return self._command(((1.0 - self._pole) * state + move) / self._input_gain)
+        wanted = ((1.0 - self._pole) * state + move) / self._input_gain
+        # `_command` moves the flow out of the dead zone, and advances the model to x(k+1).
+        return self._command(wanted)

@@ -37,28 +37,29 @@ class InternalModelController(ModelBasedController):
         super().reset()
         # Outputs x of the undelayed model at the latest samples, degC, at most `_delay` = d + 1
         # outputs from x(k-d) to x(k). In the first d samples, the oldest output is x(0) = 0,
-        # which equals x(k-d) of a model that was at rest.
+        # which equals x(k-d) of a model that was at rest. A float until the first sample, and
+        # then arrays of shape (loops,).
         self._outputs: list[Values] = [np.float64(0.0)]
 
     @property
     def _undelayed(self) -> Values:
-        """Newest output of the model without its delay, degC; 0 before the first sample."""
+        """Output x(k) of the model without its delay, degC; 0 before the first sample."""
         return self._outputs[-1]
 
     @property
     def _delayed(self) -> Values:
-        """Newest output of the model with its delay, degC; 0 before the first sample."""
+        """Output x(k-d) of the model with its delay, degC; 0 before the first sample."""
         return self._outputs[0]
 
     def _command(self, wanted: Array) -> Array:
-        """Return the commands for wanted flows, both in t/h, and update the model's output.
+        """Return the commands for wanted flows, both in t/h, and advance the model by a sample.
 
         A wanted flow inside the dead zone is moved to 0 or to the edge of the dead zone,
-        whichever is nearer.
+        whichever is nearer. The input of the model is the flow that the command gives.
         """
         command: Array = avoid_dead_zone(wanted, self.dead_zone)
         applied = applied_flow(command, self.dead_zone, self.u_min, self.u_max)
         self._outputs.append(self._pole * self._undelayed + self._input_gain * applied)
         if len(self._outputs) > self._delay:
-            del self._outputs[0]
+            del self._outputs[0]  # no longer needed, as it is older than x(k-d)
         return command

@@ -96,7 +96,8 @@ class SmithPredictor(InternalModelController):
         pi_numerator, pi_denominator = PIController(self.kp, self.ki).transfer()
         model_numerator = np.array([0.0, self._input_gain])
         model_denominator = np.array([1.0, -self._pole])
-        # The undelayed minus the delayed model is the undelayed model times 1 - z^-(delay - 1).
+        # The undelayed minus the delayed model is the undelayed model times 1 - z^-d. `_delay`
+        # is d + 1; if d is 0, both terms are in the same element, and cancel.
         in_transit = np.zeros(self._delay)
         in_transit[0] += 1.0
         in_transit[-1] -= 1.0
@@ -105,13 +106,17 @@ class SmithPredictor(InternalModelController):
         return np.convolve(pi_numerator, model_denominator), polyadd(forward, feedback)
 
     def _control(self, rows: Array) -> Array:
-        """Return the commands u(k), t/h, shape (loops,), and update the model's state."""
+        """Return the commands u(k), t/h, shape (loops,), and advance the model by a sample."""
+        # x(k) - x(k-d), the outputs of the model without and with its delay: the effect of past
+        # flows that have not yet affected the plant's output.
         in_transit = self._undelayed - self._delayed
         error = rows[:, self.error_index] - in_transit
         # The integral does not contain the present error yet.
         error_gain = self.kp + self.ki
         wanted = self._integral - error_gain * error
         # For anti-windup, the integral follows the clipped flow instead of the wanted flow.
+        # Within the limits, it changes by -Ki times the error, as without anti-windup.
         limited = np.clip(wanted, self.u_min, self.u_max)
         self._integral = self._integral + self.ki / error_gain * (limited - self._integral)
-        return self._command(wanted)  # and updates the model's state
+        # `_command` moves the flow out of the dead zone, and advances the model to x(k+1).
+        return self._command(wanted)

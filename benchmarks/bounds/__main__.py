@@ -108,19 +108,20 @@ def work(options: Options) -> None:
 def row(case: Scenario, mpc_runs: int | None) -> dict[str, str]:
     """Return a case's row of the printed table: mean errors, degC, as texts by column heading.
 
-    If `mpc_runs` is not None, the row has the error of so many runs of MPC.
+    If `mpc_runs` is not None, the row also has the error of so many runs of MPC.
     The returned text is "" for the column "without preview" if set points are not random, and
     for the column "surprise" if the set point changes before the plant has settled.
     """
     reference = partial(reference_error, samples=case.samples, **case.arguments)
     # Formatting an `Estimate`, as in f"{estimate:.4f}", adds the interval in parentheses. The
-    # error of an idle valve is the same for all kinds, of which every case has "preview".
+    # error of an idle valve does not depend on the kind of reference error; "preview" is used
+    # because this kind exists for every case.
     cells = {"case": case.name, "idle valve": f"{reference(kind='preview').idle:.4f}"}
     for kind, heading in HEADINGS.items():
         cells[heading] = ""
         with suppress(NoReferenceError):
             cells[heading] = f"{reference(kind=kind):.4f}"
-    if mpc_runs:
+    if mpc_runs is not None:
         runs = ROSTER["mpc"].run(case.arguments, case.samples, mpc_runs, SEED)
         cells["MPC"] = f"{bootstrap(mean_error(runs), seed=0):.4f}"
     return cells

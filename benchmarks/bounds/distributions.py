@@ -36,6 +36,8 @@ def normal(variance: Array, atoms: int) -> Distribution:
     # computed without scipy.stats, which takes long to import.
     ends = scipy.special.ndtri(np.linspace(0.0, 1.0, atoms + 1))
     densities = np.exp(-(ends**2) / 2.0) / np.sqrt(2.0 * np.pi)
+    # With the density p(z), the integral of z p(z) is -p(z), and each slice has the probability
+    # 1 / atoms.
     means = -np.diff(densities) * atoms
     values = np.sqrt(variance)[:, np.newaxis] * means
     return Distribution(values, np.full(values.shape, 1.0 / atoms))

@@ -124,12 +124,12 @@ def plan(
     travel_price: float = 0.0,
     penalty: ArrayLike = 0.0,
 ) -> Plan:
-    """Return the flows for which the sum of the lower bounds of the mean errors is least.
+    """Return the flows with the least sum of lower bounds of the mean errors and of prices.
 
-    Without `past` and `penalty`, the least sum of the lower bounds is a lower bound of the sum
-    of the mean errors for every controller, even for a controller that knows all future set
-    points. In the proof, y and u are the means of output and applied flow over all noise, loads
-    and random decisions of a controller:
+    Without `past`, `travel_price` and `penalty`, the least sum of the lower bounds is a lower
+    bound of the sum of the mean errors for every controller, even for a controller that knows
+    all future set points. In the proof, y and u are the means of output and applied flow over
+    all noise, loads and random decisions of a controller:
 
     - Equation (28) of the paper is linear, so the means y and u satisfy equation (28) without
       noise.
@@ -157,7 +157,8 @@ def plan(
     setpoint
         Set points y_d(k), degC, shape (samples,).
     past
-        Flows at the samples k = 0, 1, ... that the plan must not change, t/h, shape (count,).
+        Flows at the samples k = 0, 1, ... that the plan must not change, t/h, shape (count,):
+        at most samples - 1 flows, as the last flow of an episode affects no output.
     travel_price
         Price of valve travel, degC per t/h. A small price chooses, among plans with equal
         errors, the plan with the least valve travel.
@@ -175,6 +176,7 @@ def plan(
     flow[:past_count] = past
     A, B = equations(model, samples)
     if past_count < samples - 1:
+        # The errors if all flows after `past` are 0: the solution y of A y = B u is the output.
         error_without_plan = setpoint - scipy.sparse.linalg.spsolve_triangular(A, B @ flow)
         price = np.broadcast_to(np.asarray(penalty, float), samples)
         program = _program(
@@ -236,6 +238,8 @@ def _program(
         # slope above 0 to end at the set point.
         slopes = np.maximum(slopes, SMALLEST_SLOPE)
     signs = scipy.sparse.hstack([eye, -eye] * len(slopes))
+    # Rows of the n outputs, from `first` on, and columns of the n flows, from `count` on; the
+    # last flow affects no output.
     blocks = [[A[first:, first:], -B[first:, count:-1], None], [eye, None, signs]]
     right = [np.zeros(n), error_without_plan[first:]]
     # For each slope, n lengths for the positive pieces, and the same for the negative pieces.
@@ -243,12 +247,12 @@ def _program(
     costs = [np.zeros(n), price[count:-1], np.repeat(slopes, 2 * n)]
     low = [np.full(n, -np.inf), np.full(n, model.limits[0]), np.zeros(len(lengths))]
     high = [np.full(n, np.inf), np.full(n, model.limits[1]), lengths]
-    if travel_price:
+    if travel_price:  # further columns and rows, for the moves
         differences = eye - scipy.sparse.eye_array(n, k=-1)  # flow k minus flow k - 1
         moves = scipy.sparse.hstack([-eye, eye])
         blocks = [[*row, None] for row in blocks]
         blocks.append([None, differences, None, moves])
-        last_flow = past[-1] if count else 0.0
+        last_flow = past[-1] if count else 0.0  # before the first of the n flows
         right.append(np.append(last_flow, np.zeros(n - 1)))
         costs.append(np.full(2 * n, travel_price))
         low.append(np.zeros(2 * n))
@@ -323,7 +327,7 @@ def surprised_plan(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> 
         if not is_last:
             beyond = np.full(model.lag + LOOKAHEAD, setpoint[start])
             expected_setpoint = np.concatenate([expected_setpoint, beyond])
-        past = flow[:start]
+        past = flow[:start]  # without the flows that were planned for after this change
         planned = plan(model, bounds, expected_setpoint, past=past, travel_price=travel_price)
         flow = planned.flow
         errors[start:stop] = planned.errors[start:stop]
@@ -334,7 +338,7 @@ def surprised_plan(model: LinearModel, bounds: ErrorBounds, setpoint: Array) -> 
         has_settled = is_long and flow_range <= SETTLED_FLOW_RANGE * (high - low)
         if not (is_last or has_settled):
             raise NoReferenceError(
-                "setpoint must be held until the plant has settled "
+                "setpoint must be held until the plant has settled, "
                 f"got a set point that is held for {stop - start} samples"
             )
     return Plan(errors, flow)

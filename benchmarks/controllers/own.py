@@ -35,7 +35,7 @@ def own_controllers(words: Sequence[str]) -> dict[str, ControllerSpec]:
     ----------
     words
         Values of the option `--agent`, each in the form NAME=LOCATION. Several values with the
-        same NAME are several trainings of one controller.
+        same NAME are several training runs of one controller.
 
     Raises
     ------
@@ -92,15 +92,17 @@ def _with_searched_gains(file: Path) -> ControllerSpec:
 
 def _with_trained_networks(files: Sequence[str]) -> ControllerSpec:
     """Return the record of a controller with policies from NPZ files of `benchmarks.train`."""
+    # Loading checks each file. The files are taken to come from one command, so the first
+    # network describes the training of all.
     networks = [PolicyNetwork.load(file) for file in files]
     provenance = networks[0].provenance
-    samples = f"{provenance.get('steps', 0) / 1e6:.3g} M samples a policy"
+    samples = f"{provenance.get('steps', 0) / 1e6:.3g} M samples per policy"
     return replace(
         ROSTER["ppo"],
         trainings=[str(Path(file).resolve()) for file in files],
         knows=f"trained on a simulator of {_in_words(provenance.get('plant', {}))}",
         searched=f"trained by PPO: {samples}",
-        direction=KnownPlant(provenance.get("plant", {})).direction,
+        direction=KnownPlant(provenance.get("plant", {})).direction,  # {}: the paper's plant
     )
 
 

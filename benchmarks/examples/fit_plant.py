@@ -97,9 +97,10 @@ def fit_lag(applied: Array, temperature: Array) -> tuple[int, float]:
         pole = np.exp(-1.0 / np.exp(log_time_constant[0]))
         return regress(applied, temperature, delay, pole)[1]
 
+    # With a longer delay than half the log, too few rows would depend on any flow.
     delays = range(min(LONGEST_DELAY + 1, len(applied) // 2))
     # The logarithm of the time constant is searched, as the time constant must be positive. The
-    # search begins with 20 samples.
+    # search begins with a time constant of 20 samples.
     fits = [least_squares(errors, np.log([20.0]), args=(delay,)) for delay in delays]
     best_delay = int(np.argmin([fit.cost for fit in fits]))  # as the delays begin at 0
     return best_delay, float(np.exp(-1.0 / np.exp(fits[best_delay].x[0])))
