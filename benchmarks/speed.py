@@ -17,15 +17,15 @@ BATCHES = (1, 8, 64, 1024, 16384)  # numbers of plants that are stepped together
 # Numbers of plants with the option --device: 1,024 to 4,194,304.
 ON_DEVICE = tuple(4**power for power in range(5, 12))
 REFERENCE, PLANT = "CartPole-v1", "MiddlePoint-v0"
-# Arguments of the environment for the measured plants. Each key is the end of a plant's name in
-# the table.
+# Arguments of the environment for the measured plants. Each key is the ending of a plant's name
+# in the table, such as ", hard" in "MiddlePoint-v0, hard".
 PLANTS: dict[str, Any] = {"": {}, ", R = 0.5": PRESETS["noisy"], ", hard": PRESETS["hard"]}
 
 
 @options
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Compare the steps a second of the environments with those of Gymnasium's CartPole.
+    """Compare the steps per second of the environments with those of Gymnasium's CartPole.
 
     In each round, all environments are timed once. The printed ratio is the median, over all
     rounds, of the speed divided by the speed of CartPole in the same round. With --device, the
@@ -43,7 +43,7 @@ def work(options: Options) -> None:
     for n in ON_DEVICE if options.device else BATCHES:
         environments = make_environments(n, options.device)
         rates = [
-            [steps_a_second(env) for env in environments.values()]
+            [steps_per_second(env) for env in environments.values()]
             for _ in range(options.rounds)
         ]
         print(f"\nn = {n:,}\n{table(list(environments), np.array(rates))}", flush=True)
@@ -67,18 +67,19 @@ def make_environments(n: int, device: str | None) -> dict[str, Any]:
     torch.set_num_threads(1)  # one core, as for the NumPy environments
     environments: dict[str, Any] = {}
     if device is None:
+        # CartPole's own NumPy implementation of many environments, not n single environments.
         mode = "vector_entry_point"
         environments[REFERENCE] = gymnasium.make_vec(REFERENCE, n, vectorization_mode=mode)
-        for name, arguments in PLANTS.items():
-            environments[PLANT + name] = gymnasium.make_vec(PLANT, n, **arguments)
-    for name, arguments in PLANTS.items():
+        for ending, arguments in PLANTS.items():
+            environments[PLANT + ending] = gymnasium.make_vec(PLANT, n, **arguments)
+    for ending, arguments in PLANTS.items():
         plants = MiddlePointTorchEnv(n, device=device or "cpu", **arguments)
-        environments[f"in PyTorch{name}"] = plants
+        environments[f"in PyTorch{ending}"] = plants
     return environments
 
 
-def steps_a_second(env: Any) -> float:
-    """Step an environment with random actions, and return the steps of all plants a second.
+def steps_per_second(env: Any) -> float:
+    """Step an environment with random actions, and return the steps of all plants per second.
 
     `env` is a Gymnasium environment, a vector environment, or a `MiddlePointTorchEnv`.
     """
@@ -86,6 +87,7 @@ def steps_a_second(env: Any) -> float:
     steps = SINGLE_STEPS if is_single else STEPS
     env.reset(seed=0)
     env.action_space.seed(0)
+    # Few actions, used again and again, so that sampling takes no time of the measurement.
     actions = [env.action_space.sample() for _ in range(20)]
     device = getattr(env, "device", None)  # None if the environment uses NumPy
     if device is not None:
@@ -104,14 +106,14 @@ def steps_a_second(env: Any) -> float:
 
 
 def table(names: list[str], rates: NDArray[np.float64]) -> str:
-    """Return a table of the steps a second of environments, as text.
+    """Return a table of the steps per second of environments, as text.
 
-    `rates` has the steps a second in each round, shape (rounds, environments). The ratio to the
-    speed of the first environment is computed in each round. The table has the median over the
-    rounds, with the 10th and the 90th percentile in parentheses.
+    `rates` has the steps per second in each round, shape (rounds, environments). The ratio to
+    the speed of the first environment is computed in each round. The table has the median over
+    the rounds, with the 10th and the 90th percentile in parentheses.
     """
-    ratios = rates / rates[:, :1]
-    lines = [f"{'case':<22}{'steps a second':>16}  ratio to {names[0]}"]
+    ratios = rates / rates[:, :1]  # to the first environment
+    lines = [f"{'case':<22}{'steps per second':>16}  ratio to {names[0]}"]
     for i, name in enumerate(names):
         low, median, high = np.quantile(ratios[:, i], [0.1, 0.5, 0.9])
         speed = f"{name:<22}{np.median(rates[:, i]):>16,.0f}"

@@ -213,7 +213,11 @@ def cases(plant: Arguments) -> dict[str, TuningCase]:
     def square(
         samples: int, first: int, level: float, period: int, **changes: float
     ) -> TuningCase:
-        """Return the case of a square wave, whose period is an even number of samples."""
+        """Return the case of a square wave, whose period is an even number of samples.
+
+        `first` is the first sample whose error counts, and `level` the amplitude, degC. The
+        numbers are those for the paper's plant, and are scaled to the plant of the search.
+        """
         arguments = {
             **plant,
             "setpoint": "square",

@@ -31,7 +31,7 @@ class ScoreCallback(BaseCallback):
     """Score a policy during its training and at the end, and save the best policy.
 
     The policy is scored without exploration, in environments of its own, which `like` makes
-    with the normalisation statistics that the training has at the time. A training with a
+    with the normalisation statistics that the training has at the time. A training run with a
     `ScoreCallback` is equal, bit for bit, to one without. The seeds of the scored episodes
     begin at `VALIDATION_SEED` of `mptc_gym.evaluation`, and differ from the default seeds of
     `evaluate`. `MiddlePoint-v0` has the same episode for all seeds. To choose a policy in

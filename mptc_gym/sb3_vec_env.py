@@ -305,7 +305,7 @@ def _in_layers_of(training: VecEnv, plants: VecEnv) -> VecEnv:
 
 
 def _refuse(wrapper: Any) -> NoReturn:
-    """Raise a ValueError that names a wrapper around the environments of a training."""
+    """Raise a ValueError that names a wrapper around the environments of a training run."""
     raise ValueError(
         f"the model's environments are in a {type(wrapper).__name__}, which cannot be made "
         "again: pass evaluate a function that makes such environments"

@@ -83,7 +83,7 @@ def run_commands(printed: list[str], folder: Path) -> None:
 
 
 def run_training(code: str, printed: str, folder: Path) -> None:
-    """Run a training; the rounding of a training depends on the processor."""
+    """Train a policy; its rounding depends on the processor."""
     scores = [
         float(re.search(r"score (\S+);", text)[1])
         for text in (run(["-c", code], folder), printed)
@@ -92,7 +92,7 @@ def run_training(code: str, printed: str, folder: Path) -> None:
 
 
 def check_networks() -> None:
-    """Score the published networks of PPO as the page of trainings says."""
+    """Score the published networks of PPO as the page on training says."""
     page = (ROOT / "benchmarks/examples/train_your_own.md").read_text("utf-8")
     for name in ("ppo", "ppo-hard"):
         files = PRETRAINED.glob(f"{name}-[0-9]*.npz")

@@ -68,7 +68,7 @@ BLOCKS = [
         r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", page.read_text("utf-8"), re.DOTALL
     )
 ]
-# `tests/check_pages.py` runs trainings in full.
+# `tests/check_pages.py` trains in full.
 TRAININGS = [(code, printed) for code, printed in BLOCKS if printed and ".learn(" in code]
 EXAMPLES = [block for block in BLOCKS if block not in TRAININGS]
 

@@ -18,7 +18,7 @@ def test_a_rate_counts_the_steps_of_all_plants(monkeypatch):
     clock = iter([10.0, 12.0])
     monkeypatch.setattr(speed.time, "perf_counter", lambda: next(clock))
     plants = speed.make_environments(8, None)[speed.PLANT]
-    assert speed.steps_a_second(plants) == 8 * 1201 / 2.0
+    assert speed.steps_per_second(plants) == 8 * 1201 / 2.0
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,7 @@ def test_those_of_the_project_are_of_the_recipes_and_the_search_is_that_of_its_l
             assert settings[key] == written[key]
         count = sum(W.size for W, _ in network.layers)
         assert f"{count:,} weights" in ROSTER[name].searched
-        assert f": {of_name.steps / 1e6:g} M samples a policy" in ROSTER[name].searched
+        assert f": {of_name.steps / 1e6:g} M samples per policy" in ROSTER[name].searched
 
 
 def test_the_recipe_for_another_plant_is_that_of_the_paper_plant_scaled():

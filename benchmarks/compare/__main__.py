@@ -52,14 +52,14 @@ class Options:
     agent: Names = ()
     """A controller of your own, which runs in addition to those of --agents. Its form is
     NAME=MODULE:FACTORY; NAME=gains.json for a file of benchmarks.tune; or NAME=FILE.npz for a
-    file of benchmarks.train. The same name again adds another training of the controller."""
+    file of benchmarks.train. The same name again adds another training run of it."""
     scenarios: Annotated[Names, Parameter(help=_SCENARIOS_HELP)] = ()
     plant: PlantOptions = field(default_factory=PlantOptions)
     presets: bool = False
     """Run a case for each preset of the environment instead of the default cases."""
     runs: Count = 100
     """The number of runs of each controller in each case. The reference error is a mean
-    over the same runs. If plants or set points are random, it takes about a second a run."""
+    over the same runs. If plants or set points are random, it takes about a second per run."""
     seed: Seed = SEED
     """The seed of the first run (default: the seed of the first published episode)."""
     fan_out: FanOut = field(default_factory=FanOut)

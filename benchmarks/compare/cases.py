@@ -30,8 +30,8 @@ Columns = dict[str, Any]  # the columns of a table by name: arrays, or one value
 class Result:
     """The results of one controller in one scenario.
 
-    The members of a controller are its trainings, and each member has its own runs. A
-    controller without trainings has one member.
+    The members of a controller are its training runs, and each member has its own runs. A
+    controller that is not trained has one member.
 
     Attributes
     ----------

@@ -78,11 +78,11 @@ class ControllerSpec:
         Text for tables that says what was searched or trained before a comparison, and in how
         many trials and samples.
     arguments : mapping
-        Further arguments of `make` by name: gains, or a training.
+        Further arguments of `make` by name: gains, or a training run.
     trainings : sequence of str
         Files of trained networks in `agents/pretrained`, or a user's files or factories. A
-        member of the controller is the controller with one of the trainings, which `make` gets
-        as its argument `training`. Commands run all members.
+        member of the controller is the controller with one of them, which `make` gets as its
+        argument `training`. Commands run all members.
     direction : int, optional
         Sign of the gain of the plants that the controller was made for; None if the controller
         fits plants of both signs.
@@ -345,7 +345,7 @@ _SPECS = (
         make=ppo,
         trainings=_trained("ppo-[0-9]*.npz"),
         knows="dead zone; trained on a simulator of the paper's plant",
-        searched="388 weights on the paper's plant: 5 M samples a policy; settings by 79 "
+        searched="388 weights on the paper's plant: 5 M samples per policy; settings by 79 "
         "trials: 121 M samples, 30 min",
         direction=-1,
     ),
@@ -356,7 +356,7 @@ _SPECS = (
         make=ppo,
         trainings=_trained("ppo-hard-*.npz"),
         knows="limits; trained on a simulator of the plants of the preset hard",
-        searched="12,608 weights on plants that vary: 4 M samples a policy; settings by 43 "
+        searched="12,608 weights on plants that vary: 4 M samples per policy; settings by 43 "
         "trials: 36 M samples, 12 min",
         direction=-1,
     ),

@@ -5,7 +5,7 @@
 
 prints the score of the policy during the training, keeps the best policy in the folder `best`,
 and scores it on two tasks. A score is 0 for a valve that never moves, and 1 for the
-reference error. `benchmarks/train` has a training with higher scores.
+reference error. `benchmarks/train` has a training run with higher scores.
 """
 
 import argparse

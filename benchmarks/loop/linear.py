@@ -465,6 +465,8 @@ class LinearLoop:
         From each frequency to the next, the characteristic polynomial turns around 0 by at most
         `LARGEST_TURN`, unless a pole lies on the unit circle.
         """
+        # From the frequency 0 to pi, z^-n makes n / 2 turns, for the order n of the loop. With
+        # `LOW_FREQUENCIES`, the grid is dense at low frequencies, where slow poles lie.
         points = POINTS_PER_TURN * len(self.characteristic) // 2
         grid = np.union1d(np.linspace(0.0, math.pi, points + 1), LOW_FREQUENCIES)
         values = _values_on_circle(self.characteristic, grid)

@@ -36,7 +36,7 @@ class Options:
     written, and none is chosen by its result."""
     plant: PlantOptions = field(default_factory=PlantOptions)
     steps: Count | None = None
-    """The length of a training, samples of experience (default: as for the published
+    """The length of a training run, samples of experience (default: as for the published
     networks)."""
     out: Folder = None
     fan_out: FanOut = field(default_factory=FanOut)
@@ -45,8 +45,12 @@ class Options:
 def work(options: Options) -> None:
     """Train the networks that are missing in the folder, and show the results of all of them.
 
-    A `CommandError` is raised if the options name no network, a plant for a network other than
-    "ppo", or a folder with networks of another plant or other settings.
+    A `CommandError` is raised
+
+    - if the options name no network;
+    - if the options choose a plant, and another network than "ppo";
+    - if the folder has networks of another plant or of other settings;
+    - at the end, if tasks failed or the user interrupted the command.
     """
     from benchmarks.train import learning, ppo
     from benchmarks.train.recipe import RECIPES, for_plant
@@ -66,6 +70,7 @@ def work(options: Options) -> None:
     seeds = list(range(SEED, SEED + options.networks))
     if options.out:
         check_folder(options.out, ppo.settings_of(recipe))
+    # With `goes_on`, the folder may be that of an earlier run, which is continued.
     folder = new_folder(options.out, f"train-{stem}", provenance_of(seeds=seeds), goes_on=True)
     files = {seed: folder / f"{stem}-{seed}.npz" for seed in seeds}
     tasks = {
@@ -79,7 +84,7 @@ def work(options: Options) -> None:
     networks = {seed: PolicyNetwork.load(file) for seed, file in files.items() if file.exists()}
     show_validation(networks)
     print(f"The networks are in {folder}/")
-    if finished.error:
+    if finished.error:  # raised last, so that the networks that are finished are shown
         raise finished.error
     controllers = {
         name: partial(learning.score_controller, name, recipe) for name in learning.COMPARED
@@ -108,14 +113,17 @@ def check_folder(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def flattened(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the plant, which the oldest files do not name, and each setting by name."""
+    """Return the plant, which the oldest files do not name, and each setting by name.
+
+    {} is the paper's plant.
+    """
     return {"plant": settings.get("plant", {}), **settings["recipe"]}
 
 
 def show_validation(networks: Mapping[int, PolicyNetwork]) -> None:
     """Print a table with the validation results of trained networks, a row for each network.
 
-    The keys of `networks` are the seeds of the trainings.
+    The keys of `networks` are the seeds of the training runs.
     """
     import pandas as pd
 

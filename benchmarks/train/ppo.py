@@ -94,7 +94,7 @@ def train(recipe: Recipe, seed: int) -> PolicyNetwork:
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:
-    """Return the plant and the settings of a training, as the file of a network has them."""
+    """Return the plant and the settings of a training run, as the network file has them."""
     settings = asdict(recipe)
     plant = settings.pop("plant")
     del settings["scored_on"]  # which has no effect on the policy
