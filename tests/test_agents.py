@@ -144,7 +144,7 @@ def test_another_plant_is_refused(controller, arguments, num_envs, message):
 @pytest.mark.parametrize(
     ("name", "error"),
     [
-        ("nn", 1.9493986), ("pi-simc", 1.7787785), ("smith", 1.5552472), ("dahlin", 1.5607959),
+        ("nn", 1.9493986), ("pi-simc", 1.7795430), ("smith", 1.5552472), ("dahlin", 1.5607959),
         ("self-tuning", 1.3812650), ("ppo", 1.5119368), ("ppo-hard", 1.4632752),
     ],
 )  # fmt: skip
