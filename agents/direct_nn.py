@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 
 import numpy as np
@@ -13,7 +14,6 @@ from mptc_gym.plant.checks import (
     count_from_1,
     not_negative,
     number,
-    positive,
     seed,
 )
 from mptc_gym.plant.parameters import Parameters
@@ -157,7 +157,7 @@ class DirectNNController(Controller):
         self._check(count_from_1, "n_inputs", "n_hidden", "update_interval")
         self._check(not_negative, "eta", "eta_1", "eta_theta", "eta_1_theta", "weight_scale")
         self._check(number, "input_scale")
-        self._check(positive, "output_share")
+        self._check(partial(number, low=1e-9, high=1.0), "output_share")
         self._check(count_from_0, "error_index")
         self._check(seed, "seed")
         if self.direction not in (-1, 1):

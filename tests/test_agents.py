@@ -242,6 +242,11 @@ class TestDirectNN:
         # The limits stay the actuator's.
         evaluate(nn, episodes=2, u_max=20.0)
 
+    @pytest.mark.parametrize("share", [0.0, 1.1])
+    def test_a_share_that_is_no_part_of_the_range_is_refused(self, share):
+        with pytest.raises(ValueError, match="output_share must be a number from 1e-09 to 1, "):
+            DirectNNController(output_share=share)
+
     def test_extreme_inputs_do_not_overflow(self):
         batch = DirectNNController(input_scale=1e6, num_envs=2)
         assert np.isfinite(batch.act([[-1e3] * 6, [1e3] * 6])).all()
