@@ -150,7 +150,8 @@ class TrainingBatch(VectorEnv[Any, Any, Any]):
         self.num_envs = sum(batch.num_envs for batch in self.batches)
         # Number of the first plant of each batch but the first one.
         self._firsts = np.cumsum([batch.num_envs for batch in self.batches[:-1]])
-        # Shape (length of an observation, number of inputs).
+        # Shape (length of an observation, number of inputs). The order in memory decides the
+        # last bits of the products of one row at the end of an episode, so it is fixed.
         self._inputs = inputs(recipe).T.astype(np.float32, order="C")
         self.single_observation_space = Box(-np.inf, np.inf, self._inputs.shape[1:])
         self.single_action_space = self.batches[0].single_action_space
