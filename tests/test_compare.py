@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from agents import PIController
 from benchmarks.bounds import reference_error
 from benchmarks.compare import plots
 from benchmarks.compare.__main__ import main
@@ -21,7 +20,6 @@ from benchmarks.compare.cases import reference_of, run_case
 from benchmarks.compare.estimates import estimate, ranked
 from benchmarks.controllers.roster import ROSTER
 from benchmarks.loop.measures import mean_error, measure
-from benchmarks.loop.runs import make_plants, simulate
 from benchmarks.loop.scenarios import SCENARIOS
 from mptc_gym import IDS, PRESETS, Parameters, evaluate
 from mptc_gym.evaluation import SEED
@@ -40,7 +38,7 @@ BY_HAND = [
         ([4, 4, 4, -2, -2], [0, 1, 6, 0, -2]),
         # The time in itae starts again with the change: 0*4 + 1*3 + 2*2, then 0*2 + 1*0. The
         # overshoot is 2 beyond a change of 4; the second change, of -6, is not exceeded.
-        {"mae": 11 / 5, "ise": 16 + 9 + 4 + 4, "itae": 7, "overshoot": 50},
+        {"mae": 11 / 5, "itae": 7, "overshoot": 50},
     ),
     (([0, -4, -4], [9, 0, -5]), {"overshoot": 25}),
     # Within 5 % of 10 from the third sample after the change on.
@@ -51,7 +49,7 @@ BY_HAND = [
     (([10, 10, 10, 10, 0, 0], [0, 10, 10, 10, 1, 2]), {"settling_time": math.inf}),
     (
         ([1] * 6, [0] * 6, [6, 4.9, 5, -12, -10, -4], [6, 0, 5, -10, -10, 0]),
-        {"total_variation": 42, "dead_zone_share": 100 / 3, "saturation_share": 100 / 3},
+        {"total_variation": 42, "saturation_share": 100 / 3},
     ),
 ]
 
@@ -60,18 +58,6 @@ BY_HAND = [
 def test_measures_by_hand(signals, expected):
     measures = measure(trajectory(*signals), Parameters(sampling_interval=60.0))
     assert {name: measures[name][0] for name in expected} == pytest.approx(expected)
-
-
-def test_what_the_parts_of_a_run_add_to_its_error():
-    runs = simulate(make_plants(2, 1200, noise_variance=0.5), PIController(2.2, 0.3), 1200, 0)
-    names = "mae_start", "mae_changes", "mae_steady"
-    values = measure(runs, Parameters())
-    np.testing.assert_allclose(sum(values[name] for name in names), values["mae"])
-    one = np.ones_like(runs.output)  # an error of 1 degC throughout counts the samples
-    counted = measure(replace(runs, next_error=one), Parameters())
-    # The set point changes at k = 300, 600, 900 and 1200, the last sample that counts.
-    for name, samples in zip(names, (299, 181, 720), strict=True):
-        np.testing.assert_allclose(1200 * counted[name], samples)
 
 
 def some_runs(**errors):
@@ -104,9 +90,6 @@ class TestEstimates:
         assert (nn["mean"].value, nn["reference"]) == (2.0, reference.value)
         assert nn["ratio"].value == pytest.approx(2.0 / reference.value)
         assert ppo_["mean"].value == pytest.approx(1.5)
-        assert ppo_["difference"].value == pytest.approx(-0.5)
-        assert ppo_["improvement"].value == pytest.approx((1 + 0.5 + 1 + 0 + 0.5 + 1) / 6)
-        assert math.isnan(nn["difference"])
         assert nn["mean"].low < nn["mean"].value < nn["mean"].high
 
     def test_a_score_by_hand_and_the_best_comes_first(self):

@@ -107,7 +107,7 @@ def responses(agent, outputs, spread=0.0):
     return pd.DataFrame(
         {
             "agent": agent, "time_s": seconds, "setpoint": 5.0, "output_run": output,
-            "output_median": 5.0, "output_p10": 5.0 - spread, "output_p90": 5.0 + spread,
+            "output_p10": 5.0 - spread, "output_p90": 5.0 + spread,
             "applied_run": -10.0,
         }
     )  # fmt: skip

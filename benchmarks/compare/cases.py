@@ -114,31 +114,26 @@ def responses_over_time(
 ) -> Columns:
     """Return a table of a controller's temperature and flow over time, one row for each sample.
 
-    The columns are `agent`, `sample`, `time_s` (s) and `setpoint` (degC); `output_run` (degC)
-    and `applied_run` (t/h), the temperature and the applied flow of the first run; and the
-    percentiles `output_median`, `output_p10`, `output_p90`, `applied_median`, `applied_p10` and
-    `applied_p90` over all runs of all members. If the set points are random, the runs have
-    different set points, and the percentiles are the values of the first run.
+    The columns are `agent`, `time_s` (s) and `setpoint` (degC); `output_run` (degC) and
+    `applied_run` (t/h), the temperature and the applied flow of the first run; and `output_p10`
+    and `output_p90` (degC), the percentiles of the temperature over all runs of all members. If
+    the set points are random, the runs have different set points, and the percentiles are the
+    values of the first run.
     """
-    setpoint = trajectories[0].setpoint[:, 0]
-    k = np.arange(len(setpoint))
-    interval = scenario.parameters.sampling_interval
-    columns: Columns = {
+    first = trajectories[0]
+    outputs = np.hstack([trajectory.output for trajectory in trajectories])
+    if scenario.parameters.setpoint == "random":
+        outputs = outputs[:, :1]
+    band = percentiles(outputs)
+    return {
         "agent": agent,
-        "sample": k,
-        "time_s": k * interval,
-        "setpoint": setpoint,
+        "time_s": np.arange(len(outputs)) * scenario.parameters.sampling_interval,
+        "setpoint": first.setpoint[:, 0],
+        "output_run": first.output[:, 0],
+        "output_p10": band["p10"],
+        "output_p90": band["p90"],
+        "applied_run": first.applied[:, 0],
     }
-    for signal in ("output", "applied"):
-        values = np.hstack([getattr(trajectory, signal) for trajectory in trajectories])
-        columns[f"{signal}_run"] = values[:, 0]
-        if scenario.parameters.setpoint == "random":
-            values = values[:, :1]
-        # The method "nearest" returns a percentile that occurred in a run. An interpolated
-        # percentile of the applied flow could lie in the dead zone.
-        for name, percentile in percentiles(values, "nearest").items():
-            columns[f"{signal}_{name}"] = percentile
-    return columns
 
 
 def reference_of(scenario: Scenario, runs: int, seed: int) -> Reference:

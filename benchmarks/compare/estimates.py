@@ -26,8 +26,7 @@ def estimate(runs: pd.DataFrame, references: Mapping[str, Reference]) -> pd.Data
         Table with a row for each run, and the columns `scenario`, `agent` (the controller),
         `policy` (the number of the controller's member), `seed` and `mae` (the mean absolute
         error of the run, degC). The rows of a controller in a scenario are in the order of its
-        members, and of their seeds. All other controllers are compared with the controller in
-        the first row.
+        members, and of their seeds.
     references : mapping
         Reference error of each scenario by name. A scenario that has none is left out of the
         result.
@@ -41,18 +40,11 @@ def estimate(runs: pd.DataFrame, references: Mapping[str, Reference]) -> pd.Data
         - `reference`: the reference error, degC;
         - `mean`: the mean error over the runs, degC, an `Estimate`;
         - `ratio`: `mean` divided by `reference`, an `Estimate`;
-        - `scores`: an array with the score of each run, shape (members, runs);
-        - `difference`: the mean over the runs of the controller's error minus the error of the
-          first controller in the same run (the mean over its members), degC, an `Estimate`;
-        - `improvement`: the share of the runs in which the controller's error is smaller than
-          the error of the first controller, an `Estimate`. A run in which both controllers
-          have equal errors counts as half a run.
+        - `scores`: an array with the score of each run, shape (members, runs).
     """
-    first = runs["agent"].iloc[0]
     rows = []
     for name, reference in references.items():
-        errors_of = errors_by_agent(runs[runs["scenario"] == name])
-        for agent, errors in errors_of.items():
+        for agent, errors in errors_by_agent(runs[runs["scenario"] == name]).items():
             mean = bootstrap(errors, seed=BOOTSTRAP_SEED)
             row = {
                 "scenario": name,
@@ -62,12 +54,6 @@ def estimate(runs: pd.DataFrame, references: Mapping[str, Reference]) -> pd.Data
                 "ratio": mean.scaled(1 / reference.value),
                 "scores": reference.score(errors),
             }
-            if agent != first and first in errors_of:
-                errors_of_first = errors_of[first].mean(axis=0)
-                differences = errors - errors_of_first
-                is_better = (differences < 0.0) + 0.5 * (differences == 0.0)
-                row["difference"] = bootstrap(differences, seed=BOOTSTRAP_SEED)
-                row["improvement"] = bootstrap(is_better, seed=BOOTSTRAP_SEED)
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -125,10 +111,9 @@ def write_table(path: Path, table: pd.DataFrame) -> None:
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():
-        if any(isinstance(cell, Estimate) for cell in cells):
+        if isinstance(cells.iloc[0], Estimate):
             for field, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
-                # A cell without an estimate is NaN, which does not have the attribute.
-                columns[f"{name}{suffix}"] = [getattr(cell, field, math.nan) for cell in cells]
+                columns[f"{name}{suffix}"] = [getattr(cell, field) for cell in cells]
         else:
             columns[name] = cells.replace(math.inf, "not settled")
     pd.DataFrame(columns).to_csv(path, index=False)

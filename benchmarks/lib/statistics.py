@@ -128,19 +128,13 @@ def bootstrap(*tasks: NDArray[np.float64], seed: int) -> Estimate:
     return Estimate(mean, float(low), float(high), all_values.size)
 
 
-def percentiles(values: NDArray[np.float64], method: Any = "linear") -> dict[str, Any]:
+def percentiles(values: NDArray[np.float64]) -> dict[str, Any]:
     """Return the percentiles `median`, `p10` (10th) and `p90` (90th) over runs.
 
-    Parameters
-    ----------
-    values
-        Array of shape (..., runs). Each returned percentile has the shape (...).
-    method
-        The argument `method` of `numpy.percentile`. If a value is infinite, such as the
-        settling time of a run that never settles, the method "higher" is used instead of
-        `method`, since an infinite value cannot be interpolated.
+    `values` has the shape (..., runs), and each returned percentile the shape (...).
     """
-    if not np.isfinite(values).all():
-        method = "higher"
+    # An infinite value, such as the settling time of a run that never settles, cannot be
+    # interpolated.
+    method: Any = "linear" if np.isfinite(values).all() else "higher"
     median, p10, p90 = np.percentile(values, (50, 10, 90), axis=-1, method=method)
     return {"median": median, "p10": p10, "p90": p90}

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from benchmarks.loop.runs import Trajectory
 from mptc_gym import Parameters
-from mptc_gym.plant.actuator import least_effective_command
 from mptc_gym.scores import mean_absolute_error, valve_travel
 
 Array = NDArray[np.float64]
@@ -17,26 +16,18 @@ Array = NDArray[np.float64]
 # Largest error of a settled output, divided by the set-point change (in `measure`) or by the
 # set point (in `settled`).
 SETTLING_BAND = 0.05
-START_SAMPLES = 300  # length of the start of a run: half a period of the square wave
-RESPONSE_SAMPLES = 60  # length of the response to a set-point change
 LAST_SAMPLES = 50  # number of last samples of a run from which `settled` decides
 
 
 def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     """Return the measures of each run by their names in CSV files, each of shape (runs,).
 
-    `parameters` are the arguments of the environment in which the controller ran. The measures
-    `mae`, `mae_start`, `mae_changes`, `mae_steady` and `ise` use the errors e(k) at the samples
-    k = 1 to N, and the other measures use the signals at the samples k = 0 to N - 1. A set
-    point other than 0 at k = 0 counts as a set-point change for `overshoot` and
-    `settling_time`. The measures are:
+    `parameters` are the arguments of the environment in which the controller ran. The measure
+    `mae` uses the errors e(k) at the samples k = 1 to N, and the other measures use the signals
+    at the samples k = 0 to N - 1. A set point other than 0 at k = 0 counts as a set-point
+    change for `overshoot` and `settling_time`. The measures are:
 
     - `mae`: mean of |e(k)|, degC;
-    - `mae_start`: contribution of the samples k below `START_SAMPLES` to `mae`, degC;
-    - `mae_changes`: contribution to `mae` of the later samples that lie less than
-      `RESPONSE_SAMPLES` samples after a set-point change, degC;
-    - `mae_steady`: contribution of the remaining samples to `mae`, degC;
-    - `ise`: integral of e^2 over time, degC^2 min;
     - `itae`: integral of t |e| over time, degC min^2, where t is the time since the latest
       set-point change, or since k = 0 before the first change;
     - `total_variation`: valve travel, the sum of the magnitudes of all changes of the applied
@@ -46,69 +37,22 @@ def measure(trajectory: Trajectory, parameters: Parameters) -> dict[str, Array]:
     - `settling_time`: time from a set-point change until the error stays within `SETTLING_BAND`
       times the change, min; the maximum over all changes, and infinite if the output has not
       settled before the next change or the end of the run;
-    - `dead_zone_share`: share of samples with the command inside the dead zone, %;
     - `saturation_share`: share of samples with the command at or beyond a limit, %.
-
-    `dead_zone_share` and `saturation_share` are NaN if the dead zone is drawn from a range.
     """
     interval = parameters.sampling_interval / 60.0  # min
-    errors = np.abs(trajectory.next_error)
+    limits = parameters.lowest  # u_min and u_max are never ranges
+    command = trajectory.command
+    is_at_limit = (command <= limits.u_min) | (command >= limits.u_max)
     step_measures = [
         _measure_steps(setpoint, output)
         for setpoint, output in zip(trajectory.setpoint.T, trajectory.output.T, strict=True)
     ]
     return {
         "mae": mean_error(trajectory),
-        **_parts_of_error(trajectory),
-        "ise": interval * np.square(errors).sum(axis=0),
         "itae": interval**2 * np.array([run.itae for run in step_measures]),
         "total_variation": valve_travel(trajectory.applied),
         "overshoot": 100.0 * np.array([run.overshoot for run in step_measures]),
         "settling_time": interval * np.array([run.settling_time for run in step_measures]),
-        **_actuator_shares(trajectory.command, parameters),
-    }
-
-
-def _parts_of_error(trajectory: Trajectory) -> dict[str, Array]:
-    """Return what the start, the set-point changes and the rest of a run add to its mean error.
-
-    The returned dict has the measures `mae_start`, `mae_changes` and `mae_steady` of `measure`
-    by name, degC, in arrays of shape (runs,).
-    """
-    errors = np.abs(trajectory.next_error)
-    k = np.arange(1, len(errors) + 1)[:, np.newaxis]
-    setpoint_moves = np.diff(trajectory.next_setpoint, axis=0, prepend=trajectory.setpoint[:1])
-    # Sample number of the latest set-point change. Before the first change, the number is so
-    # small that no sample belongs to a response.
-    changes = np.where(setpoint_moves != 0.0, k, -RESPONSE_SAMPLES)
-    latest_change = np.maximum.accumulate(changes, axis=0)
-    is_start = k < START_SAMPLES
-    is_response = k < latest_change + RESPONSE_SAMPLES
-    return {
-        "mae_start": (errors * is_start).mean(axis=0),
-        "mae_changes": (errors * (~is_start & is_response)).mean(axis=0),
-        "mae_steady": (errors * (~is_start & ~is_response)).mean(axis=0),
-    }
-
-
-def _actuator_shares(command: Array, parameters: Parameters) -> dict[str, Array]:
-    """Return the percentages of commands in the dead zone and at or beyond a limit.
-
-    The returned dict has arrays of shape (runs,) by the names of the measures in `measure`.
-
-    The percentages are NaN if the dead zone in `parameters` is a range.
-    `command` has the commanded flows, t/h, shape (samples, runs).
-    """
-    if "dead_zone" in parameters.ranges:
-        unknown = np.full(command.shape[1], np.nan)
-        return {"dead_zone_share": unknown, "saturation_share": unknown}
-    u_min, u_max = parameters.u_min, parameters.u_max
-    # The smallest magnitude of a command, t/h, that the plant treats as outside the dead zone.
-    edge = least_effective_command(parameters.dead_zone, u_min, u_max)
-    is_inside = np.abs(command) < edge
-    is_at_limit = (command <= u_min) | (command >= u_max)
-    return {
-        "dead_zone_share": 100.0 * is_inside.mean(axis=0),
         "saturation_share": 100.0 * is_at_limit.mean(axis=0),
     }
 
