@@ -132,6 +132,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         mask = self._checked_mask(options or {})
         if not self._was_reset and not mask.all():
             raise ResetNeeded("the first reset must include all environments")
+        # Checks and applies the seed, and any options of the subclass.
         self._prepare(mask, seed, options or {})
         infos = self._begin_episodes(mask, infos={})
         self._was_reset = True
@@ -178,7 +179,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         if reset_now is not None and reset_now.all():  # no plant advances
             infos = self._begin_episodes(reset_now, infos={})
             rewards = self._zeros + 0.0  # a copy, as the caller may overwrite the rewards
-            terminations = self._as_array(~reset_now)
+            terminations = self._as_array(~reset_now)  # all False
             truncations = self._as_array(~reset_now)
             return self._window.present(), rewards, terminations, truncations, infos
 
@@ -231,8 +232,10 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
             self._ended = still_ended if still_ended.any() else None
         flags = self._as_array(mask)
         first_infos = self._begin(mask)
-        # The masks of a step, which are True for all plants, stay as they are. A dict lists the
-        # names and not a set, whose order would differ from process to process.
+        # The masks of a step, which are True for all plants, stay as they are. Infos that
+        # `first_infos` lacks are 0 at k = 0, and infos that a step lacks, such as a sampled
+        # delay, are 0 for plants outside `mask`. A dict lists the names and not a set, whose
+        # order would differ from process to process.
         for name in dict.fromkeys([*self._info_names, *first_infos]):
             values = first_infos.get(name, self._zeros)
             infos[name] = self._where(flags, values, infos.get(name, 0))
@@ -260,7 +263,8 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
         """Check the seed and the options of a `reset` of the plants in `mask`, and apply both.
 
-        A ValueError is raised if the seed or an option is invalid.
+        A ValueError is raised if the seed or an option is invalid. The options contain any
+        `reset_mask`, from which `mask` comes.
         """
 
     @abstractmethod

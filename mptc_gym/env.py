@@ -44,7 +44,7 @@ def observation_space(parameters: Parameters) -> Space[Observation]:
     """
     span = parameters.temperature_span
     # The largest magnitudes of a set point, an error, an output and an action in an
-    # observation.
+    # observation, in the order of `Parameters.windows`.
     limits = np.array([span, 2.0 * span, span, 1.0], np.float32)
     high = np.repeat(limits, parameters.windows)
     return Box(-high, high, dtype=np.float32)
@@ -339,14 +339,14 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
             are ranges.
         """
         super().reset(seed=seed)
-        self._own_signals()
+        self._own_signals()  # which are about to change, and may belong to a `get_state`
         if self._root is not self.np_random:  # at the first reset, or after a new seed
             self._root = self.np_random
             seeds = cast("np.random.SeedSequence", self._root.bit_generator.seed_seq)
             self._streams = [RandomStreams.spawn(seeds)]
         arrays_of_numbers = self._plant_sampler.sample(self._streams)
         setpoint = self._signals.reset(ONLY_PLANT, self._streams, arrays_of_numbers).item()
-        numbers = plant_numbers(arrays_of_numbers, 0)
+        numbers = plant_numbers(arrays_of_numbers, 0)  # of the only plant
         self._plant = Plant(self.parameters, numbers)
         self._coming_signals.clear()
         if self.parameters.action == "change":
@@ -373,7 +373,8 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         if self.parameters.is_disturbed:
             info["disturbance"] = 0.0
         info |= self._plant.factors
-        info |= numbers.select(self.parameters.ranges)
+        info |= numbers.select(self.parameters.ranges)  # what this reset has sampled
+        # The count `size` leaves out the additional element at the end.
         return np.fromiter(self._window, _FLOAT32, size), info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, float]]:
@@ -413,7 +414,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         if not self._coming_signals:
             if not self._streams:  # random number streams, which the first reset makes
                 raise ResetNeeded("call reset before step")
-            self._own_signals()
+            self._own_signals()  # as in `reset`
             # In reverse order, because `pop` returns the last element of the list.
             self._coming_signals = self._signals.ahead()[::-1]
         setpoint, noise, load, measurement_noise = self._coming_signals.pop()
@@ -527,6 +528,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
         self._streams = state.streams
         self.np_random.bit_generator.state = state.np_random
         self._np_random_seed = state.seed
+        # None makes the next reset start new streams from `np_random`.
         self._root = self.np_random if state.continues_streams else None
 
     def _own_signals(self) -> None:
@@ -561,7 +563,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
             return None
         if self._record is None:
             raise ResetNeeded("call reset before render")
-        from mptc_gym import rendering
+        from mptc_gym import rendering  # which needs pygame, an optional package
 
         if self.render_mode == "rgb_array":
             return rendering.frame(self._record)
@@ -571,7 +573,7 @@ class MiddlePointEnv(HasJsonSpec, gymnasium.Env[Observation, Action]):
     def close(self) -> None:
         """Close the window, if this environment has shown pictures."""
         if self.render_mode == "human" and self._record is not None:
-            import pygame
+            import pygame  # optional, but present where pictures have been shown
 
             pygame.display.quit()
         self._record = None

@@ -267,7 +267,7 @@ def _run(
     """
     n = plants.num_envs
     rounds: list[_Runs] = []
-    for first in seeds[::n]:
+    for first in seeds[::n]:  # all plants run an episode in each round
         seeds_of_round = range(first, first + n)
         samples = rollout(plants, start(policy, n), EPISODE_STEPS, seeds_of_round)
         if is_replayed:
@@ -356,6 +356,8 @@ def _stored_cases() -> dict[Parameters, _StoredCase]:
         errors_by_seed = {SEED: np.array(record["reference"])}
         if "validation_reference" in record:
             errors_by_seed[VALIDATION_SEED] = np.array(record["validation_reference"])
+        # The kind "surprise" is the error of a controller that expects no change of the set
+        # point, which another controller may expect.
         case = _StoredCase(errors_by_seed, is_bound=record["kind"] != "surprise")
         cases[case_of(Parameters(**record["arguments"]))] = case
     return cases

@@ -116,9 +116,10 @@ def _act_by_predict(predict: Callable[..., Any], n: int) -> Act:
 
     def act(observations: Any) -> Any:
         """Return the actions from `predict`, and keep the returned state for the next call."""
+        # With those keywords that `predict` takes; only the first call starts an episode.
         returned = predict(observations, **{name: keywords[name] for name in names})
         keywords["episode_start"] = np.zeros(n, np.bool_)
-        if isinstance(returned, tuple):
+        if isinstance(returned, tuple):  # actions and state
             returned, keywords["state"] = returned
         return returned
 
@@ -185,6 +186,7 @@ def _make_plants(policy: Any, env: Any, n: int, arguments: Mapping[str, Any]) ->
     if first.unwrapped is second.unwrapped:
         reject("env", first, "a function that makes a new environment at each call")
     if isinstance(first, gymnasium.Env):
+        # The two environments that are already made count.
         makers = [lambda: first, lambda: second, *[env] * (n - 2)]
         return SyncVectorEnv(makers[:n])
     second.close()
@@ -202,7 +204,7 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Reset all plants with successive seeds, of which the list `seed` has the first."""
-        self.venv.seed(seed[0])
+        self.venv.seed(seed[0])  # a `VecEnv` counts on from the first seed, at its next reset
         observations = self.venv.reset()
         return observations, _in_arrays(self.venv.unwrapped.reset_infos)
 
@@ -257,7 +259,7 @@ def _freeze_statistics(plants: Plants) -> None:
         if "norm_obs" in vars(layer):  # a VecNormalize
             layer.training = False
         statistics = vars(layer).get("obs_rms")
-        if statistics is not None and statistics.count < 1.0:
+        if statistics is not None and statistics.count < 1.0:  # initial statistics count 1e-4
             raise ValueError(
                 f"env must have the statistics of the policy's training in "
                 f"{type(layer).__name__}, got initial ones: set its obs_rms to that of the "
@@ -321,7 +323,7 @@ def replayed(
         if k > 0:
             commands = sample.infos.get("command", np.zeros(len(seeds)))
             actions = action_from_command(commands, case.u_min, case.u_max)
-            expected = plants.step(np.reshape(actions, (-1, 1)))[-1]
+            expected = plants.step(np.reshape(actions, (-1, 1)))[-1]  # the infos
         _compare_infos(sample.infos, expected, k)
         yield sample
 

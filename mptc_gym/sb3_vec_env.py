@@ -91,6 +91,7 @@ class GymnasiumVecEnv(VecEnv):
         If no seeds have been set since the latest reset, the random number generators continue
         without a new seed.
         """
+        # `_seeds` are those of `seed`, or None for each environment after `_reset_seeds`.
         observations, self.infos = self.batch.reset(seed=self._seeds)
         self.reset_infos = [_infos_of_one(self.infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
@@ -260,7 +261,7 @@ def like(
     training = model.get_env()
     if training is None:
         raise ValueError("model must have its environments, as after PPO.load(path, env=...)")
-    spec = training.get_attr("spec")[0]
+    spec = training.get_attr("spec")[0]  # an element for each environment, all alike
     if spec is None:
         raise ValueError(
             "the model's environments must come from gymnasium.make or make_vec_env, whose "
@@ -299,6 +300,7 @@ def _in_layers_of(training: VecEnv, plants: VecEnv) -> VecEnv:
         return frozen
     if isinstance(training, VecFrameStack):
         return VecFrameStack(plants, training.stacked_obs.n_stack)
+    # A wrapper that only records is left out, and any other cannot be made again.
     if not isinstance(training, _VEC_RECORDERS):
         _refuse(training)
     return plants

@@ -76,10 +76,10 @@ class _Signal:
     """A signal of n plants, whose random numbers come from the environment's generator.
 
     Every subclass has two methods. `reset(mask, numbers)` begins an episode of the plants in
-    `mask`, which have the parameter values `numbers`, and returns the values at k = 0, degC,
-    shape (n,); those of other plants have no meaning. `next(samples, k)` computes a block of
-    successive samples, beginning with sample k, and returns the values, degC, shape (samples,
-    n). No load changes after the first sample of a block.
+    `mask`, and returns the values at k = 0, degC, shape (n,); those of other plants have no
+    meaning. `numbers` holds the parameter values of all plants. `next(samples, k)` computes a
+    block of successive samples, beginning with sample k, and returns the values, degC, shape
+    (samples, n). No load changes after the first sample of a block.
     """
 
     def __init__(self, zeros: Tensor, generator: torch.Generator) -> None:
@@ -97,30 +97,35 @@ class _Noise(_Signal):
     `c` holds the coefficients of the polynomial C, from z^0 on.
     """
 
-    def __init__(self, name: str, c: Sequence[float], *args: Any) -> None:
-        super().__init__(*args)
+    def __init__(
+        self, name: str, c: Sequence[float], zeros: Tensor, generator: torch.Generator
+    ) -> None:
+        super().__init__(zeros, generator)
         self._variance_name = f"{name}_variance"
         self._c = c
         # White noise of the samples before the latest block, which C needs, and of the block.
         self._xi = [self._zeros] * (len(c) - 1)
 
     def reset(self, mask: Tensor, numbers: PlantNumbers[Any]) -> Tensor:
+        """Begin an episode of the plants in `mask`, and return n(0) = 0, shape (n,)."""
         self._deviation = getattr(numbers, self._variance_name) ** 0.5
         self._xi = [xi.masked_fill(mask, 0.0) for xi in self._xi]
         return self._zeros
 
     def next(self, samples: int, k: SampleNumber) -> Tensor:
+        """Return the noise of the next samples, degC, shape (samples, n)."""
         new_xi = self._zeros.new_empty(samples, len(self._zeros))
         new_xi.normal_(generator=self._generator).mul_(self._deviation)
         self._xi += new_xi.unbind()
         xi = torch.stack(self._xi)
         noise = new_xi
         for lag, coefficient in enumerate(self._c[1:], start=1):
-            first = len(self._c) - 1 - lag
+            first = len(self._c) - 1 - lag  # row of xi(k - lag), as row len(c) - 1 is xi(k)
             noise = noise.add(xi[first : first + samples], alpha=coefficient)
         return noise
 
     def end_block(self, samples: int) -> None:
+        """Forget the latest block, except for its first samples, which steps have returned."""
         # As many values up to the present sample as C needs.
         self._xi = self._xi[samples : samples + len(self._c) - 1]
 
@@ -128,17 +133,21 @@ class _Noise(_Signal):
 class _RepeatedSetPoint(_Signal):
     """Set point that repeats one sequence of levels for all plants."""
 
-    def __init__(self, levels: SetPointLevels, *args: Any) -> None:
-        super().__init__(*args)
+    def __init__(
+        self, levels: SetPointLevels, zeros: Tensor, generator: torch.Generator
+    ) -> None:
+        super().__init__(zeros, generator)
         self._levels = self._zeros.new_tensor(levels.values)
         # The samples of a period at which the levels end.
         self._ends = torch.tensor(levels.lengths, device=self._levels.device).cumsum(0)
         self._period = sum(levels.lengths)
 
     def reset(self, mask: Tensor, numbers: PlantNumbers[Any]) -> Tensor:
+        """Return the set points y_d(0), degC, shape (n,): the first level."""
         return self._levels[0].expand(len(mask))
 
     def next(self, samples: int, k: SampleNumber) -> Tensor:
+        """Return the set points of the next samples, degC, shape (samples, n)."""
         rows = torch.arange(samples, device=self._ends.device)[:, None]
         # The index of the level is the number of ends that a sample has reached.
         indices = torch.bucketize((k + rows) % self._period, self._ends, right=True)
@@ -152,21 +161,26 @@ class _RandomSetPoint(_Signal):
     next level of each plant.
     """
 
-    def __init__(self, levels: SetPointLevels, *args: Any) -> None:
-        super().__init__(*args)
+    def __init__(
+        self, levels: SetPointLevels, zeros: Tensor, generator: torch.Generator
+    ) -> None:
+        super().__init__(zeros, generator)
         self._distribution = levels
         self._level = self._next_level = self._zeros  # degC
         # The sample numbers k at which the present and the next level end.
         self._end = self._next_end = self._zeros.to(torch.int64)
 
     def reset(self, mask: Tensor, numbers: PlantNumbers[Any]) -> Tensor:
+        """Begin an episode of the plants in `mask`, and return y_d(0), degC, shape (n,)."""
         levels, lengths = self._draw()
         self._level = torch.where(mask, levels, self._level)
-        self._end = torch.where(mask, lengths, self._end)
+        self._end = torch.where(mask, lengths, self._end)  # as the episode begins with k = 0
         return self._level
 
     def next(self, samples: int, k: SampleNumber) -> Tensor:
-        # Make the next level of the block before the present level where it has begun.
+        """Return the set points of the next samples, degC, shape (samples, n)."""
+        # Make the next level of the block before the present level where it has begun, before
+        # the sample k. Elsewhere, another next level is drawn in its place.
         has_ended = self._end < k
         self._level = torch.where(has_ended, self._next_level, self._level)
         self._end = torch.where(has_ended, self._next_end, self._end)
@@ -185,17 +199,25 @@ class _RandomSetPoint(_Signal):
 class _Load(_Signal):
     """Load disturbance w(k) of n plants, as `mptc_gym.plant.signals.Disturbance` defines it."""
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
+    def __init__(self, zeros: Tensor, generator: torch.Generator) -> None:
+        super().__init__(zeros, generator)
         self._level = self._walk = self._zeros  # a level that jumps, and a random walk, degC
 
     def reset(self, mask: Tensor, numbers: PlantNumbers[Any]) -> Tensor:
+        """Begin an episode of the plants in `mask`, and return w(0) = 0, shape (n,).
+
+        The load of other plants goes on, and the returned 0 has no meaning for them.
+        """
         self._numbers = numbers
         self._level = self._level.masked_fill(mask, 0.0)
         self._walk = self._walk.masked_fill(mask, 0.0)
         return self._zeros
 
     def next(self, samples: int, k: SampleNumber) -> Tensor:
+        """Return the loads of the next samples, degC, shape (samples, n): all rows are equal.
+
+        The load changes at sample k alone, as the environment ends a block before a change.
+        """
         is_due = k % LOAD_INTERVAL == 0
         # A tensor is not tested, as the test would wait for the device.
         if isinstance(is_due, Tensor) or is_due:
@@ -251,6 +273,7 @@ class _Plants:
         self._zeros = zeros
         self._differentiable = differentiable
         self._dynamics = Dynamics(parameters)
+        # The limits are never ranges, so `lowest` has the limits of every plant.
         self._limits = parameters.lowest.u_min, parameters.lowest.u_max
         self._half_range = (self._limits[1] - self._limits[0]) / 2.0
         self._middle = zeros.new_tensor(sum(self._limits) / 2.0)
@@ -343,6 +366,7 @@ class _Plants:
         if isinstance(k_of_change, Tensor):
             k_of_change = k_of_change.to(self._zeros.dtype)
         factors = self._dynamics.factors(self._numbers, k_of_change)
+        # Tensors of shape (n,), even where all plants have one factor.
         self.factors = [self._zeros + factor for factor in factors]
         self._alpha, self._scale, self._load_gain = self._dynamics.coefficients(*factors)
 
@@ -388,11 +412,13 @@ class _Window:
         """
         zeros = torch.zeros_like(setpoint)
         observed_action = rest_action.clamp(-1.0, 1.0)
-        newest = setpoint, setpoint, zeros, observed_action  # the temperature is 0
+        # In the order of `windows`. At rest, the temperature is 0, and so is each earlier set
+        # point.
+        newest = setpoint, setpoint, zeros, observed_action
         earlier = zeros, zeros, zeros, observed_action
         for rows, newest_value, earlier_value in zip(self._rows, newest, earlier, strict=True):
             for i, row in enumerate(rows):
-                value = earlier_value if i else newest_value
+                value = earlier_value if i else newest_value  # row 0 is the newest
                 rows[i] = torch.where(mask, value, row)
 
     def add(self, setpoint: Tensor, error: Tensor, output: Tensor, action: Tensor) -> Tensor:
@@ -401,7 +427,7 @@ class _Window:
         The sample consists of set points y_d(k+1), observed errors and outputs, all in degC,
         and normalised actions a(k), each of shape (n,).
         """
-        if self._rows[-1]:
+        if self._rows[-1]:  # the window of past actions is not empty
             action = action.clamp(-1.0, 1.0)
         for rows, newest in zip(self._rows, (setpoint, error, output, action), strict=True):
             rows.insert(0, newest)
@@ -566,13 +592,14 @@ class MiddlePointTorchEnv(BatchEnv):
         self.checks_actions = self.device.type == "cpu"
         self._action = self._zeros  # the actions of the last step
         # Parameter values of the plants; a range is replaced by an element for each plant.
+        # Until the first `_begin`, these elements are 0.
         self._numbers: dict[str, Any] = dict(vars(parameters.lowest))
         self._numbers |= dict.fromkeys(parameters.ranges, self._zeros)
         self._start: SampleNumber = 0  # clock at k = 0 of all plants or of each plant
         self._change_phases: list[int] = []  # clocks of changes of load or dynamics, modulo 10
         levels = SetPointLevels(parameters)
         setpoint = _RandomSetPoint if levels.random else _RepeatedSetPoint
-        random = self._zeros, self._generator
+        random = self._zeros, self._generator  # the last arguments of each `_Signal`
         self._signals: dict[str, Any] = {"setpoint": setpoint(levels, *random)}
         if parameters.is_disturbed:
             self._signals["disturbance"] = _Load(*random)
@@ -585,10 +612,11 @@ class MiddlePointTorchEnv(BatchEnv):
         self._ahead: list[_Step] = []  # the remaining steps of the block, the next step last
         self._most_samples = min(MOST_BLOCK_SAMPLES, self._plants.most_samples)
         if self.device.type == "cpu":
-            # On other devices, blocks are as long as possible, as every call takes long.
+            # On other devices, blocks are as long as possible, as every call takes long. With
+            # very many plants, blocks of less than `DRIFT_INTERVAL` samples are no faster.
             samples_in_cache = max(DRIFT_INTERVAL, VALUES_IN_CACHE // num_envs)
             self._most_samples = min(self._most_samples, samples_in_cache)
-        if levels.random:
+        if levels.random:  # at most one level of a plant ends in a block
             self._most_samples = min(self._most_samples, levels.shortest)
 
     __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
@@ -624,7 +652,7 @@ class MiddlePointTorchEnv(BatchEnv):
             a = self._wanted_flows.change(a)
         command, applied = self._plants.apply(a)
         if not self._ahead:
-            self._compute_block()
+            self._compute_block()  # which needs the flows up to the present one
         step = self._ahead.pop()
         observations = self._window.add(*step.observed, a)
         rewards = step.rewards
@@ -699,11 +727,12 @@ class MiddlePointTorchEnv(BatchEnv):
         tensor of shape (num_envs,), in which the elements of plants outside `mask` have no
         meaning.
         """
-        self._end_block()
-        if mask.all():
+        self._end_block()  # as the rest of the block does not have the new episodes
+        if mask.all():  # no plant depends on earlier actions any more
             self.detach()
         flags = self._as_array(mask)
         starts = self._starts
+        # A number, which is faster, if all plants begin now.
         self._start = self._clock if (starts == self._clock).all() else self._as_array(starts)
         if self.parameters.is_disturbed or self.parameters.drifts:
             # Load and dynamics of a plant change when its sample number k is a multiple of 10.
@@ -738,13 +767,20 @@ class MiddlePointTorchEnv(BatchEnv):
         return torch.from_numpy(values).to(self.device, copy=True, non_blocking=True)
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Restart the random number generator of all plants with the seed, if there is one."""
+        """Restart the random number generator of all plants with the seed, if there is one.
+
+        A ValueError is raised if `seed` is invalid. There are no options.
+        """
         if seed is not None:
             self._generator.manual_seed(checks.seed("seed", seed))
         self._np_random_seed = self._generator.initial_seed()
 
     def _checked_actions(self, actions: Any) -> Tensor:
-        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended."""
+        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended.
+
+        A ValueError is raised if the shape is not (num_envs, 1), or, with `checks_actions`, if
+        an action is not finite.
+        """
         try:
             column = torch.as_tensor(actions, dtype=self.dtype, device=self.device)
         except NOT_A_NUMBER as error:

@@ -142,7 +142,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             return None
         if not self._records:
             raise ResetNeeded("call reset before render")
-        from mptc_gym import rendering
+        from mptc_gym import rendering  # which needs pygame, an optional package
 
         return tuple(map(rendering.frame, self._records.values()))
 
@@ -224,13 +224,16 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         # One test for all plants, which is fast: if the sum of the squared readings is at most
         # the squared span, no reading is beyond the span.
         span = self.parameters.temperature_span
-        if not reading.dot(reading) <= span * span:
+        if not reading.dot(reading) <= span * span:  # not `>`, which is false for NaN
             reading = np.fmin(reading, span)  # NaN becomes the highest reading
             np.fmax(reading, -span, out=reading)
         return reading
 
     def _begin(self, mask: Mask) -> dict[str, NDArray[Any]]:
-        """Begin an episode of the plants in `mask`, and return the infos that are not 0."""
+        """Begin an episode of the plants in `mask`, and return the infos that are not 0.
+
+        Elements of the infos for plants outside `mask` have no meaning.
+        """
         which = np.flatnonzero(mask)  # the indices of the plants
         streams = [self._streams[i] for i in which.tolist()]
         numbers = self._plant_sampler.sample(streams)
@@ -251,7 +254,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
 
         infos: dict[str, NDArray[Any]] = {**self._plants.factors}
         new_values = {"setpoint": setpoint, "error": setpoint}
-        new_values |= numbers.select(self.parameters.ranges)
+        new_values |= numbers.select(self.parameters.ranges)  # what this reset has sampled
         for name, values in new_values.items():
             infos[name] = np.zeros(self.num_envs, values.dtype)
             infos[name][which] = values
@@ -267,18 +270,24 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return final_observations
 
     def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Restart the random number streams of the plants in `mask` that have a seed."""
+        """Restart the random number streams of the plants in `mask` that have a seed.
+
+        A ValueError is raised if `seed` is invalid. There are no options.
+        """
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():
             seed_of_plant = seeds[i]
             if seed_of_plant is None and i not in self._streams:  # at the first reset
-                seed_of_plant = np.random.SeedSequence().entropy
+                seed_of_plant = np.random.SeedSequence().entropy  # from the operating system
             if seed_of_plant is not None:
                 self._seeds[i] = int(seed_of_plant)
                 self._streams[i] = RandomStreams.of_seed(int(seed_of_plant))
 
     def _checked_seeds(self, seed: Any) -> Sequence[Any]:
-        """Return a seed or None for each plant; plant i of an integer seed gets seed + i."""
+        """Return a seed or None for each plant; plant i of an integer seed gets seed + i.
+
+        A ValueError is raised if `seed` is invalid.
+        """
         n = self.num_envs
         if seed is None:
             return [None] * n
@@ -292,7 +301,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         return list(seeds)
 
     def _checked_actions(self, actions: Any) -> Values:
-        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended."""
+        """Return the actions, shape (num_envs,), with 0 for plants whose episode has ended.
+
+        A ValueError is raised if the shape is not (num_envs, 1), or an action not finite.
+        """
         return many_actions(actions, self.num_envs, self._ended)
 
 
@@ -317,7 +329,7 @@ def parameters_of(env: Any) -> Parameters:
     if isinstance(env.unwrapped, MiddlePointVectorEnv):
         return env.unwrapped.parameters
     try:
-        parameters = env.get_attr("parameters")[0]
+        parameters = env.get_attr("parameters")[0]  # an element for each plant, all alike
     except AttributeError:
         parameters = None
     if not isinstance(parameters, Parameters):
@@ -346,9 +358,10 @@ class _Window:
         for window in windows:
             self._newest.append(np.s_[:, size] if window else None)
             size += window
-        self._past_actions = np.s_[:, size - windows[-1] :]
+        self._past_actions = np.s_[:, size - windows[-1] :]  # the last block
         self._shape = num_envs, size
         self._elements = num_envs * size
+        # With room for so many steps, after which `add` moves the observations back to the end.
         self._row = np.zeros(self._elements + STEPS_PER_SHIFT, np.float32)
         self._place = STEPS_PER_SHIFT  # index in `_row` at which the first observation begins
 
@@ -370,7 +383,7 @@ class _Window:
         observations = np.zeros((len(which), self._shape[1]), np.float32)
         observed_action = np.clip(rest_action, -1.0, 1.0)
         observations[self._past_actions] = np.reshape(observed_action, (-1, 1))
-        setpoints, errors, _, _ = self._newest
+        setpoints, errors, _, _ = self._newest  # outputs stay 0
         if setpoints is not None:
             observations[setpoints] = setpoint
         if errors is not None:

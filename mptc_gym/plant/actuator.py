@@ -181,19 +181,22 @@ class WantedFlows:
     parameters
         Arguments of the environment.
     flows
-        Wanted flows before k = 0: zeros, shape (n,), in an array or a tensor. All operators in
-        `change` are those that arrays and tensors of any library share.
+        Wanted flows before k = 0: zeros, shape (n,), in an array or a tensor, and 0.0 for the
+        subclass `WantedFlow`. All operators in `change` are those that arrays and tensors of
+        any library share.
     """
 
     # Rounds an array to float32, and keeps its type.
     _to_float32 = staticmethod(_round_array)
 
     def __init__(self, parameters: Parameters, flows: Any) -> None:
+        # The limits are never ranges, so `lowest` has the limits of every plant.
         self._u_min = parameters.lowest.u_min
         self._u_max = parameters.lowest.u_max
         self._flow_per_action = parameters.max_move * (self._u_max - self._u_min) / 2.0
         self._flows = flows  # v, t/h
-        # An array, as a product of a mask and a float would have the default type of a library.
+        # An array for arrays of flows, as `change` multiplies masks by it: the product of a
+        # mask and a float would have the default type of a library.
         self._dead_zone = flows + parameters.compensated_dead_zone
         self._slope_above = _slope(self._u_max, parameters.compensated_dead_zone)
         self._slope_below = _slope(-self._u_min, parameters.compensated_dead_zone)
@@ -210,6 +213,7 @@ class WantedFlows:
         """
         flows = self._flows + self._flow_per_action * actions.clip(-1.0, 1.0)
         self._flows = flows.clip(self._u_min, self._u_max)
+        # The formulas of u for v > 0 and for v < 0, of which a mask makes one or both 0.
         is_above = self._flows > 0.0
         is_below = self._flows < 0.0
         edges = is_above * self._dead_zone - is_below * self._dead_zone

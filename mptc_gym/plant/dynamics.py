@@ -159,7 +159,7 @@ class Plant:
         )
         self._drifts = parameters.drifts
         self.factors: dict[str, float] = {}
-        self._k = 0
+        self._k = 0  # the present sample, counted only if the plant drifts
         self._dynamics = Dynamics(parameters)
         self._update_dynamics()  # which sets `_alpha`, `_scale` and `_load_gain`
         # Past temperatures and applied flows, the newest first. When `step` computes y(k+1),
@@ -266,6 +266,7 @@ class PlantBatch:
         numbers: dict[str, Values] = {}
         for name, lowest in vars(parameters.lowest).items():
             shape = (num_envs,) if name in parameters.ranges else ()
+            # For a range, its low end, until `reset` sets the sampled numbers.
             numbers[name] = np.full(shape, lowest, float)
         self.numbers: PlantNumbers[Values] = PlantNumbers(**numbers)
         self._update_actuator()
@@ -273,12 +274,12 @@ class PlantBatch:
         self._dynamics = Dynamics(parameters)
         # Times in samples since the plants were created: the present time, the start of each
         # plant's episode, and the time at which the next drifting gain or time constant
-        # changes.
+        # changes. The time is counted only if the plants drift.
         self._clock = 0
         self._starts = np.zeros(num_envs, np.int64)
         self._next_update = 0
         self.factors: dict[str, Values] = {}
-        self._update_dynamics()
+        self._update_dynamics()  # which sets `_alpha`, `_scale` and `_load_gain`
         order = len(self._alpha)
         self._outputs = deque(np.zeros((order, num_envs)), maxlen=order)  # newest first
         self._input_response = _InputResponse(parameters, num_envs)
@@ -299,7 +300,7 @@ class PlantBatch:
         if ranges:
             self._update_actuator()
         self._starts[plants] = self._clock
-        if ranges or self._parameters.drifts:
+        if ranges or self._parameters.drifts:  # other numbers, or a drift that begins again
             self._update_dynamics()
 
     def step(
@@ -392,7 +393,7 @@ class _InputResponse:
     def __init__(self, parameters: Parameters, num_envs: int) -> None:
         self._num_envs = num_envs
         self._beta = tuple(parameters.b)
-        shortest, self._longest = map(int, parameters.range_of("delay"))
+        shortest, self._longest = map(int, parameters.range_of("delay"))  # d, samples
         self._block_rows = shortest + 1
         # Number of rows of `_flows` above the block of flows, with the older flows.
         self._older_rows = len(self._beta) - 1 + self._longest - shortest
@@ -420,6 +421,7 @@ class _InputResponse:
         # have no effect before that.
         self._response[:, plants] = 0.0
         if self._delays_differ:
+            # With a shorter delay, a plant responds to later flows, in later rows.
             first_rows = self._longest - delays.astype(np.intp)
             rows = np.arange(len(self._delayed_flows))[:, np.newaxis] + first_rows
             self._delayed_indices[:, plants] = rows * self._num_envs + plants
@@ -449,6 +451,7 @@ class _InputResponse:
             flows = flows.take(self._delayed_indices, out=self._delayed_flows, mode="clip")
         self._response[:] = 0.0
         for lag, beta in enumerate(self._beta):
-            first_row = len(self._beta) - 1 - lag
+            first_row = len(self._beta) - 1 - lag  # a further coefficient needs older flows
             self._response += beta * flows[first_row : first_row + self._block_rows]
+        # The latest rows become the older flows of the next block.
         self._flows[: self._older_rows] = self._flows[self._block_rows :]

@@ -109,7 +109,7 @@ def slowest_pole(a: Sequence[float]) -> complex:
 
     `a` holds the coefficients of the polynomial A of equation (28) of the paper, from z^0 on.
     """
-    poles = np.roots([*a, 0.0])
+    poles = np.roots([*a, 0.0])  # the 0 adds a pole of 0, which is all that degree 0 has
     return complex(poles[np.argmax(np.abs(poles))])
 
 
@@ -272,11 +272,12 @@ class Parameters(PlantNumbers[Number]):
 
     def _check_actuator(self) -> None:
         """Raise a ValueError if limits of the flow and dead zone do not fit together."""
+        # The limits are never ranges, so `lowest` has the limits of every plant.
         u_min, u_max = self.lowest.u_min, self.lowest.u_max
         if u_min >= u_max:
             reject("u_min", u_min, f"below u_max = {u_max}")
         largest_command = max(abs(u_min), abs(u_max))
-        if self.range_of("dead_zone")[1] > largest_command:
+        if self.range_of("dead_zone")[1] > largest_command:  # the widest dead zone
             allowed = f"at most {largest_command:g}, the largest magnitude of a command"
             reject("dead_zone", self.dead_zone, allowed)
 
@@ -287,6 +288,7 @@ class Parameters(PlantNumbers[Number]):
         neither complex nor negative.
         """
         pole = slowest_pole(self.a)
+        # The least factor of any episode, at its start or at the end of its drift.
         shortest = self.lowest.time_constant_factor * min(self.lowest.time_constant_drift, 1.0)
         if pole.imag != 0.0 or not 0.0 < pole.real < 1.0 or shortest < 1.0 - pole.real:
             reject(
@@ -396,7 +398,7 @@ def full_signature(constructor: Callable[..., Any]) -> inspect.Signature:
     in place of `**arguments`, and leaves out `self`.
     """
     parameters = list(inspect.signature(constructor).parameters.values())
-    parameters = parameters[1:-1]  # without `self` and `**arguments`
+    parameters = parameters[1:-1]  # without `self` and `**arguments`, the first and the last
     for parameter in inspect.signature(Parameters).parameters.values():
         annotation = parameter.annotation
         if parameter.name in PLANT_NUMBERS:  # whose annotation is a type variable

@@ -62,7 +62,7 @@ class EpisodeStream:
         """Return a copy at the same place in the stream, faster than the default deep copy."""
         duplicate = copy(self)
         if hasattr(self, "generator"):
-            bits: Any = np.random.PCG64(_ANY_SEED)
+            bits: Any = np.random.PCG64(_ANY_SEED)  # `state` below replaces that of this seed
             bits.state = self.generator.bit_generator.state
             duplicate.generator = np.random.Generator(bits)
         return duplicate
@@ -75,7 +75,7 @@ class EpisodeStream:
             self._first_state = self.generator.bit_generator.state
         else:
             bits: Any = self.generator.bit_generator
-            bits.state = self._first_state
+            bits.state = self._first_state  # back to the start of the stream
             bits.advance(self._episode * 2**64)
         self._episode += 1
         return self.generator
@@ -152,6 +152,7 @@ class PlantSampler:
         if not self._uses_stream:
             return self._lowest
         uniform = np.empty((len(streams), RESERVED_RANDOM_NUMBERS))
+        # All reserved numbers are drawn, so that those of the load begin after them.
         for streams_of_plant, uniform_of_plant in zip(streams, uniform, strict=True):
             streams_of_plant.plant.next_episode().random(out=uniform_of_plant)
         numbers: dict[str, NDArray[Any]] = {}

@@ -52,7 +52,7 @@ def noise_polynomials(parameters: Parameters) -> dict[str, Sequence[float]]:
     always 0.
     """
     polynomials: dict[str, Sequence[float]] = {}
-    if parameters.range_of("noise_variance")[1] > 0.0:
+    if parameters.range_of("noise_variance")[1] > 0.0:  # the highest variance
         polynomials["noise"] = parameters.c
     if parameters.range_of("measurement_noise_variance")[1] > 0.0:
         polynomials["measurement_noise"] = (1.0,)
@@ -83,7 +83,7 @@ class RandomSignal(ABC):
         The caller must not modify the returned array.
         """
         if self._next_row == len(self._block):
-            self._fill(np.arange(self._block.shape[1]), 0)
+            self._fill(np.arange(self._block.shape[1]), 0)  # the whole block, of all plants
             self._next_row = 0
         values: Values = self._block[self._next_row]
         self._next_row += 1
@@ -93,7 +93,7 @@ class RandomSignal(ABC):
         """Return the signal of a single plant at the samples of a block, degC, in a list."""
         generators = [self._streams[0].generator]
         block = self._generate(ONLY_PLANT, generators, len(self._block))
-        values: list[float] = block[0].tolist()
+        values: list[float] = block[0].tolist()  # the row of the only plant
         return values
 
     def _begin(self, plants: Indices, streams: Sequence[EpisodeStream]) -> None:
@@ -115,6 +115,7 @@ class RandomSignal(ABC):
             # A slice is much faster than indices, but needs plants without gaps.
             has_gaps = chunk[-1] - chunk[0] >= len(chunk)
             columns = chunk if has_gaps else slice(chunk[0], chunk[-1] + 1)
+            # `_generate` returns a row per plant, and `_block` has a row per sample.
             self._block[first_row:, columns] = self._generate(chunk, generators, samples).T
 
     @abstractmethod
@@ -163,22 +164,23 @@ class Noise(RandomSignal):
         self._scaled_c[:, plants] = deviations[..., np.newaxis] * self._c
         self._past_xi[plants] = 0.0
         for stream in streams:
-            stream.next_episode()
+            stream.next_episode()  # moves the stream's generator to the new episode
         self._begin(plants, streams)
 
     def _generate(
         self, plants: Indices, generators: Sequence[np.random.Generator], samples: int
     ) -> Values:
-        order = len(self._c) - 1
+        """Return the noise of the next samples, degC, shape (len(plants), samples)."""
+        order = len(self._c) - 1  # number of earlier values of xi that a sample needs
         xi = np.empty((len(plants), order + samples))
         xi[:, :order] = self._past_xi[plants]
         for generator, new_xi in zip(generators, xi[:, order:], strict=True):
             generator.standard_normal(out=new_xi)
-        self._past_xi[plants] = xi[:, samples:]
+        self._past_xi[plants] = xi[:, samples:]  # the last `order` values
         c = self._scaled_c[:, plants]
         noise: Values = c[0] * xi[:, order:]
         for lag, coefficient in enumerate(c[1:], start=1):
-            noise += coefficient * xi[:, order - lag : -lag]
+            noise += coefficient * xi[:, order - lag : -lag]  # `lag` samples earlier
         return noise
 
 
@@ -261,7 +263,7 @@ class RepeatedSetPoint:
         """Begin an episode of the plants `plants`, and return the set points y_d(0), degC."""
         self._starts[plants] = self._clock
         self._next_change = 0  # a time that has passed, so that `next` looks up the levels
-        return np.full(len(plants), self._levels[0])
+        return np.full(len(plants), self._levels[0])  # every episode begins with this level
 
     def next(self) -> Values:
         """Return the set points of all plants at the next sample, degC, shape (num_envs,).
@@ -334,6 +336,7 @@ class RandomSetPoint(RandomSignal):
     def _generate(
         self, plants: Indices, generators: Sequence[np.random.Generator], samples: int
     ) -> Values:
+        """Return the set points of the next samples, degC, shape (len(plants), samples)."""
         # The levels of one plant after the other, degC, and their durations, samples.
         levels: list[float] = []
         lengths: list[int] = []
@@ -350,6 +353,7 @@ class RandomSetPoint(RandomSignal):
             self._levels[i] = levels[-1]
             self._samples_left[i] = known - samples
             lengths[-1] -= known - samples  # The last level goes on after these samples.
+        # The durations of each plant's levels sum to `samples`.
         return np.repeat(levels, lengths).reshape(len(plants), samples)
 
 
@@ -403,7 +407,8 @@ class Disturbance(RandomSignal):
     def _generate(
         self, plants: Indices, generators: Sequence[np.random.Generator], samples: int
     ) -> Values:
-        ages = self._ages[plants]
+        """Return the loads of the next samples, degC, shape (len(plants), samples)."""
+        ages = self._ages[plants]  # samples since the latest change
         changes = (ages + samples) // LOAD_INTERVAL  # of the load of each plant
         self._ages[plants] = (ages + samples) % LOAD_INTERVAL
         # For each change, three random numbers from 0 to 1: one for the step of the walk, one
@@ -415,6 +420,7 @@ class Disturbance(RandomSignal):
             generator.random(out=uniform_of_plant[:count])
         walks = self._walks(plants, uniform[..., 0])
         levels = self._levels(plants, uniform[..., 1], uniform[..., 2])
+        # Column 0 is before the first of these changes, so column `changes` is after the last.
         rows = np.arange(len(plants))
         self._last_walks[plants] = walks[rows, changes]
         self._last_levels[plants] = levels[rows, changes]
@@ -477,6 +483,7 @@ class Signals(NamedTuple):
         """
         levels = SetPointLevels(parameters)
         polynomials = noise_polynomials(parameters)
+        # Number of random signals; a set point that is not random has no block.
         blocks = levels.random + parameters.is_disturbed + len(polynomials)
         samples = _block_samples(blocks * num_envs, episode_length)
         setpoint: RepeatedSetPoint | RandomSetPoint = RepeatedSetPoint(levels, num_envs)
@@ -519,7 +526,7 @@ class Signals(NamedTuple):
             variances = numbers.measurement_noise_variance
             noise_streams = [s.measurement_noise for s in streams]
             self.measurement_noise.reset(plants, noise_streams, variances)
-        if isinstance(self.setpoint, RepeatedSetPoint):
+        if isinstance(self.setpoint, RepeatedSetPoint):  # which needs no random numbers
             return self.setpoint.reset(plants)
         return self.setpoint.reset(plants, [s.setpoint for s in streams])
 
@@ -531,7 +538,7 @@ class Signals(NamedTuple):
         """
         columns: list[list[float]] = []
         for signal in self:
-            if signal is None:
+            if signal is None:  # always 0
                 columns.append([0.0] * SAMPLES_AT_A_TIME)
             else:
                 columns.append(signal.ahead())
