@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.controllers.known_plant import PAPER, KnownPlant
 from benchmarks.controllers.roster import ROSTER, ControllerSpec
-from benchmarks.controllers.spans import SPANS, Spans, spans_for
+from benchmarks.controllers.spans import SPANS, Spans
 from benchmarks.lib.command import CommandError, Count, Folder, Parameter, command, options
 from benchmarks.lib.fan_out import with_progress_bar
 from benchmarks.lib.outputs import new_folder, provenance_of, write_json
@@ -104,7 +104,7 @@ def work(options: Options) -> None:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     name = options.controller
     plant = options.plant.arguments()
-    spans = spans_for(name, KnownPlant(plant))
+    spans = SPANS[name](KnownPlant(plant))
     provenance = provenance_of(seeds={"sampler": SEED, "runs": FIRST_RUN})
     folder = new_folder(options.out, f"tune-{name}", provenance, goes_on=True)
     try:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping
 
 from benchmarks.controllers.known_plant import PAPER, KnownPlant
-from benchmarks.lib.command import CommandError
 
 Spans = Mapping[str, tuple[float, float]]  # an interval for each gain, by the name of the gain
 
@@ -19,6 +18,8 @@ def pi_spans(plant: KnownPlant) -> Spans:
     t/h per degC and sample. The interval of `kp` is inversely proportional to the gain of
     `plant`, and proportional to the ratio of its time constant and its delay, as in the rule
     SIMC. The interval of `ki` is proportional to that of `kp`, divided by the time constant.
+    `plant` has a gain and a time constant other than 0, since the options that choose a plant
+    refuse others.
     """
     # Both factors are 1 for the paper's plant.
     slowness = (time_constant(plant) / lag(plant)) / (time_constant(PAPER) / lag(PAPER))
@@ -60,18 +61,3 @@ SPANS: dict[str, Callable[[KnownPlant], Spans]] = {
     "nn": nn_spans,
     "pi": pi_spans,
 }
-
-
-def spans_for(name: str, plant: KnownPlant) -> Spans:
-    """Return the intervals for the gains of the controller `name` of `SPANS`.
-
-    A `CommandError` is raised if the plant has no gain or no time constant, such as an
-    integrator.
-    """
-    if not 0.0 < plant.model.slowest_pole < 1.0 or plant.gain == 0.0:
-        a, b = list(plant.parameters.a), list(plant.parameters.b)
-        raise CommandError(
-            "a search for gains needs a stable plant with a time constant and a gain other "
-            f"than 0, got a={a}, b={b}"
-        )
-    return SPANS[name](plant)
