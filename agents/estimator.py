@@ -204,7 +204,7 @@ def _steady_kalman_filter(F: Array, Q: Array) -> tuple[Array, Array]:
     P = Q  # covariance of x(k) before the measurement at k
     change = np.inf
     while change > RICCATI_TOLERANCE:
-        S = P[:, :1, :1]
+        S = P[:, :1, :1]  # variance of the first element, which is measured
         K = P[:, :, :1] / S
         P_next = F @ (P - K @ P[:, :1]) @ F.transpose(0, 2, 1) + Q
         change = np.abs(P_next - P).max()
@@ -241,6 +241,7 @@ class Estimator:
         self._candidates = candidates
         filters = len(candidates.log_constants)
         shape = len(candidates.delays), filters, n
+        # Responses, flows and states are replaced at each sample, never changed in place.
         self._s = np.zeros((filters, n))
         self._last_s = self._s
         self._last_u = np.zeros(n)
@@ -266,7 +267,7 @@ class Estimator:
         length = len(self._past_x_s)
         self._past_x_s[self._k % length] = self._x_s
         self._past_nu_s[self._k % length] = nu_s
-        delayed = (self._k - candidates.delays) % length
+        delayed = (self._k - candidates.delays) % length  # the row of k - d for each delay d
         self._k += 1
         gains, weights = self._learn(nu_y, self._past_nu_s[delayed])
 
@@ -274,8 +275,9 @@ class Estimator:
         from_y = candidates.to_forecast @ self._x_y
         from_s = candidates.to_forecast @ self._past_x_s[delayed]
         forecasts = from_y[:, :, 0] - gains * from_s[:, :, 0]
+        # A mean over the candidates, as all estimates are.
         forecast_variance = np.tensordot(candidates.forecast_variances, weights, 2)
-        of_filters = weights.sum(0)
+        of_filters = weights.sum(0)  # probabilities of the filters, summed over the delays
         of_delays = weights.sum(1)
         return Estimate(
             gain=_mean(weights, gains),

@@ -80,6 +80,7 @@ class RandomSetpoint:
         deviations
             Standard deviations of the forecast errors, in the unit of `amplitude`, shape (n,).
         """
+        # The factor of r - s in tanh, and the factor of r in the second term.
         slopes = 0.5 * LOGISTIC / deviations
         pulls_to_zero = (1.0 - held) / self.amplitude
         near_zero = np.zeros_like(setpoints)

@@ -108,10 +108,12 @@ class PolicyNetwork(Controller):
             raise ValueError(f"action must be 'flow' or 'change', got {self.action!r}")
         self.observation = dict.fromkeys(WINDOWS, 0) | dict(self.observation)
         self.n_obs = sum(self.observation.values())
+        # In float32, as in training; copies, as the caller may change the arrays.
         self.layers = [
             (np.array(W, np.float32), np.array(b, np.float32)) for W, b in self.layers
         ]
-        # The inputs of a layer are the outputs of the layer before.
+        # The inputs of a layer are the outputs of the layer before. The last layer has a single
+        # output, the action.
         sizes = [self.n_obs, *(b.size for _, b in self.layers)]
         shapes = [W.shape for W, _ in self.layers]
         if shapes != list(zip(sizes[1:], sizes[:-1], strict=True)) or sizes[-1] != 1:
@@ -187,6 +189,8 @@ class PolicyNetwork(Controller):
         network's training.
         """
         super().check_environment(parameters, n)
+        # Another `compensated_dead_zone` is allowed. If actions set the flow, `max_move` has no
+        # effect.
         names = [*WINDOWS, "max_move"] if self.action == "change" else WINDOWS
         expected = {name: self.interface[name] for name in names}
         received = {name: getattr(parameters, name) for name in names}
@@ -203,7 +207,7 @@ class PolicyNetwork(Controller):
         for W, b in hidden_layers:
             x = np.tanh(x @ W.T + b)
         outputs = (x @ last_W.T + last_b).astype(np.float64)
-        output: NDArray[np.float64] = np.clip(outputs[:, 0], -1.0, 1.0)
+        output: NDArray[np.float64] = np.clip(outputs[:, 0], -1.0, 1.0)  # the only column
         if self.action == "change":
             half_range = (self.u_max - self.u_min) / 2.0
             return self.max_move * half_range * output

@@ -128,6 +128,7 @@ class PIController(Controller):
             Coefficients of z^0 and z^-1 in the numerator and in the denominator of the transfer
             function, two arrays of shape (2,).
         """
+        # -Kp (1 - z^-1) - Ki, over the denominator 1 - z^-1.
         numerator = np.array([-(self.kp + self.ki), self.kp])
         return numerator, np.array([1.0, -1.0])
 
@@ -142,6 +143,7 @@ class PIController(Controller):
             # The part of the change that leads beyond a limit. It is the whole change if the
             # command was beyond the limit before, because of the proportional part.
             needless = np.clip(excess, np.minimum(change, 0.0), np.maximum(change, 0.0))
+            # The sum changes so that -Ki times the sum changes by -needless.
             total = total + needless / self.ki
             command = command - needless
         self._sum = total

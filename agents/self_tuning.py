@@ -137,6 +137,7 @@ class SelfTuningController(ModelBasedController):
         delays = np.arange(_transport_delay(shortest), _transport_delay(longest) + 1)
         # The prior of the delay, and of the logarithm of the time constant, is a normal
         # distribution.
+        # The delay from a command to the first output that changes is d + 1 samples.
         delay_logarithms = -0.5 * np.square((delays + 1.0 - likely) / spread)
         constant_logarithms = -0.5 * np.square(np.log(TIME_CONSTANTS) / CONSTANT_SPREAD)
         return Candidates(
@@ -188,7 +189,7 @@ class SelfTuningController(ModelBasedController):
         """
         if self._k == 0:
             self._start(rows)
-        if self._k % self._samples_held == 0:
+        if self._k % self._samples_held == 0:  # else the commands are held
             setpoint = rows[:, self.setpoint_index] / self._unit_temperature
             output = setpoint - rows[:, self.error_index] / self._unit_temperature
             self._estimate = self._estimator.observe(output)
@@ -197,7 +198,7 @@ class SelfTuningController(ModelBasedController):
             # The commands, t/h, of this sample and of those until the next computation.
             self._held: Array = np.clip(outside, self.u_min, self.u_max)
             applied = applied_flow(self._held, self.dead_zone, self.u_min, self.u_max)
-            self._estimator.apply(applied / self._unit_flow)
+            self._estimator.apply(applied / self._unit_flow)  # which the next outputs need
         self._k += 1
         return self._held
 

@@ -166,7 +166,7 @@ def finals(
     for present in WITH_THE_SAME_GAINS[name]:
         spec = ROSTER[present]
         if spec.direction in (None, KnownPlant(plant).direction):
-            started, _ = spec.start(plant, 1, 0)
+            started, _ = spec.start(plant, 1, 0)  # for its gains, which it has as attributes
             gains = {gain: getattr(started, gain) for gain in spans}
             scores = score(spec, plant, FINAL_RUNS, FINAL_FIRST_RUN)
             row = {"gains": f"of {spec.label}", **gains, **scores, "in the search": ""}
@@ -294,6 +294,7 @@ def search(
 
 def gains_of(magnitudes: Mapping[str, float], spans: Spans) -> dict[str, float]:
     """Return the gains of a trial, which have the signs of `spans`, from their magnitudes."""
+    # Both ends of an interval have the same sign.
     return {gain: math.copysign(magnitudes[gain], ends[0]) for gain, ends in spans.items()}
 
 

@@ -111,6 +111,7 @@ class SetPointLaw:
         # The output's response to a flow of 1 t/h at one sample, degC. Element 0 is the first
         # output that the flow can affect.
         zeros = model.lag - int(model.numbers.delay) - 1  # leading zeros of B
+        # `impulse_response` begins d + 1 samples after the flow, with as many zeros.
         self._impulse = at_start.impulse_response(samples + zeros)[zeros:]
 
     def penalty(self, setpoint: Array) -> Array:
@@ -161,6 +162,8 @@ class SetPointLaw:
         count = self._longest - first + 1
         change_probability = np.clip((ages - first + 1) / count, 0.0, 1.0)
         expected: Array = (1.0 - change_probability) * slope_if_held[ages]
+        # The mean, over these ages c of the next change, of the slope `age - c` samples after
+        # it, as a difference of cumulative sums.
         expected += (change_sums[ages + count] - change_sums[ages]) / count
         return expected
 

@@ -149,6 +149,7 @@ def reference_error(
         return _reference(*case, kind)
     if has_random_setpoint:
         return _reference(*case, "causal")
+    # One episode is enough, as set points that are not random are the same in all episodes.
     setpoint = _episodes_of(parameters, samples, 1, seed).setpoints[0]
     if np.ptp(setpoint) == 0.0:  # The set point is constant.
         return _reference(*case, "preview")
@@ -220,7 +221,7 @@ def in_standard_units(parameters: Parameters) -> tuple[Parameters, float]:
     always 0, the unit of temperature stays 1 degC.
     """
     temperature = parameters.largest_setpoint / DEFAULTS.largest_setpoint or 1.0
-    limits = parameters.lowest
+    limits = parameters.lowest  # u_min and u_max are never ranges
     default_limits = DEFAULTS.lowest
     flow = (limits.u_max - limits.u_min) / (default_limits.u_max - default_limits.u_min)
     sizes = {

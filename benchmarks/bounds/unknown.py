@@ -102,7 +102,7 @@ def error_bounds(model: LinearModel) -> ErrorBounds:
     changes = load_changes(model)
     noise = normal(variance, NOISE_ATOMS)
     if largest_step:
-        for effect in changes.effects.T:
+        for effect in changes.effects.T:  # of a step of the walk at one change of the load
             step = uniform(largest_step * effect, WALK_ATOMS)
             noise = sum_of(noise, step, NOISE_ATOMS)
     if not amplitude:

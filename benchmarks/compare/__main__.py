@@ -107,6 +107,7 @@ def work(options: Options) -> None:
         for case, task in task_of_reference.items()
         if task in finished.results
     }
+    # The other results are the reference errors.
     results = [item for item in finished.results.values() if isinstance(item, Result)]
     if results:
         text = write(

@@ -75,6 +75,7 @@ def plot_scores(
             row += 1
             for agent in agents:
                 scores_of_runs = estimates.loc[estimates["agent"] == agent, "scores"]
+                # Scores of the members' runs, an array for each case.
                 of_cases = np.maximum([np.mean(values) for values in scores_of_runs], 0.0)
                 line: Any = {"color": look.colour, "marker": "|", "ms": 8, "lw": 1.3}
                 axes.plot(of_cases, np.full(len(of_cases), row), **line)
@@ -121,7 +122,7 @@ def plot_responses(
     title = scenario.title
     if len(agents) > 1:
         compared = [agent for agent in PAPER_CONTROLLERS if agent in agents]
-        if len(compared) < 2:
+        if len(compared) < 2:  # not both controllers of the paper are drawn
             compared = agents
         best = min(compared, key=errors.__getitem__)
         worst = max(compared, key=errors.__getitem__)
@@ -200,9 +201,9 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
     `rows` are the rows of one controller in the argument `responses` of `plot_responses`. If
     the dead zone of the plant is a range of values, the picture shows the smallest value.
     """
-    dead_zone = plant.range_of("dead_zone")[0]
+    dead_zone = plant.lowest.dead_zone
     axes.axhspan(-dead_zone, dead_zone, **DEAD_ZONE)
-    for limit in (plant.range_of("u_min")[0], plant.range_of("u_max")[0]):
+    for limit in (plant.lowest.u_min, plant.lowest.u_max):  # which are never ranges
         axes.axhline(limit, **LIMIT)
     minutes = rows["time_s"].to_numpy() / 60.0
     flows = rows["applied_run"].to_numpy()

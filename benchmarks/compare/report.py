@@ -212,7 +212,7 @@ def score_table(comparison: Comparison, text: Callable[[Estimate, str], str]) ->
         for name, ratio in zip(estimates["scenario"], estimates["ratio"], strict=True):
             row[name] = text(ratio, ".2f")
         row["score"] = text(score, ".3f")
-        row["travel (t/h)"] = f"{travels[agent].mean():,.0f}"
+        row["travel (t/h)"] = f"{travels[agent].mean():,.0f}"  # over the cases
         rows.append(row)
     columns = ["controller", *comparison.references, "score", "travel (t/h)"]
     return pd.DataFrame(rows, columns=columns).fillna("")

@@ -52,6 +52,7 @@ class KnownPlant:
         parameters = Parameters(**arguments)
         self.arguments = dict(arguments)
         self.parameters = parameters
+        # These are never ranges.
         self.limits: dict[str, Any] = {"u_min": parameters.u_min, "u_max": parameters.u_max}
         self.dead_zone = sum(parameters.range_of("dead_zone")) / 2
         self.widest_dead_zone = parameters.range_of("dead_zone")[1]

@@ -192,6 +192,7 @@ class PredictiveController:
         observation = np.asarray(observation, dtype=np.float64)
         setpoint = observation[:, 0]
         if self._k > 0:  # The state at k = 0 is known: the plant is at rest.
+            # The newest error follows the set points. Set point minus error is the reading.
             error = observation[:, self._parameters.setpoint_window]
             self._filter(setpoint - error)
         model = self._model(self._k)
@@ -224,6 +225,7 @@ class PredictiveController:
         self._age = np.where(setpoint == self._setpoint, self._age + 1, 0)
         self._setpoint = setpoint
         ages = self._age[:, np.newaxis].astype(np.float64)
+        # Column i of the forecasts is i + 1 samples ahead.
         held = self._random.probability_held(ages, self._reached_columns + 1.0)
         deviation = self._deviation[:, np.newaxis]
         targets = self._random.targets(setpoint[:, np.newaxis], held, deviation)
@@ -258,6 +260,7 @@ class PredictiveController:
         F, Q = self._transition(self._k, plants)
         state = np.einsum("nij,nj->ni", F, self._state)
         # The past flows that the coefficients of B multiply in the equation of y(k).
+        # They are at 0 samples ahead, in the first row of each run.
         flows = np.take_along_axis(self._flows, self._flow_columns[:, 0], axis=1)
         state[:, 0] += (flows * plants.beta).sum(axis=1)
         gain, self._covariance = self._gain_and_covariance(self._covariance, F, Q)
@@ -301,7 +304,8 @@ class PredictiveController:
         """
         runs = np.arange(self._num_envs)[:, np.newaxis, np.newaxis]
         # The past flow that each coefficient of B multiplies in the equation of each forecast
-        # output, or 0; shape (runs, outputs, coefficients of B).
+        # output, or 0; shape (runs, outputs, coefficients of B). The forecasts begin with 1
+        # sample ahead.
         flows = self._flows[runs, self._flow_columns[:, 1:]]
         models = [self._model(self._k + 1 + i).plants for i in range(flows.shape[1])]
         flows *= np.stack([plants.beta for plants in models], axis=1)

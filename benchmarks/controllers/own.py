@@ -63,7 +63,7 @@ def own_controllers(words: Sequence[str]) -> dict[str, ControllerSpec]:
 def _controller(locations: Sequence[str]) -> ControllerSpec:
     """Return the record of a controller at `locations`, without its name, label and group."""
     if locations[0].endswith(".json"):
-        (file,) = locations
+        (file,) = locations  # a ValueError if there are several
         return _with_searched_gains(Path(file))
     if locations[0].endswith(".npz"):
         return _with_trained_networks(locations)

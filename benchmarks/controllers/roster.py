@@ -115,6 +115,7 @@ class ControllerSpec:
 
     def members(self) -> "list[ControllerSpec]":
         """Return the controllers to start: one for each training, or this one if none."""
+        # A member has no trainings, and so is its own only member.
         members = [
             replace(self, arguments={"training": training}, trainings=())
             for training in self.trainings
@@ -238,6 +239,7 @@ def ppo(plant: KnownPlant, runs: int, seed: int, training: str) -> Made:
     `training` is the file of the network. If a dead zone was compensated in the training, the
     dead zone of `plant` is compensated instead, unless that is a range.
     """
+    # The absolute path of a user's file takes the place of the folder `PRETRAINED`.
     network = PolicyNetwork.load(PRETRAINED / training, **plant.limits)
     interface = network.interface
     if network.compensated_dead_zone and "dead_zone" not in plant.parameters.ranges:

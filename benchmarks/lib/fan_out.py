@@ -109,6 +109,7 @@ class FanOut:
         calls = [joblib.delayed(_attempt)(name, task) for name, task in tasks.items()]
         if self.backend == "ray":
             _connect_to_ray()
+            # For Joblib, -1 is one task per core.
             by_ray: list[Outcome] = joblib.Parallel(self.jobs or -1, backend="ray")(calls)
             return by_ray
         # A terminal sends Ctrl-C to all processes, but only the first process shall act on it.
@@ -140,6 +141,7 @@ def _attempt(name: str, task: Task) -> Outcome:
 
 def _summary(failures: Mapping[str, str]) -> list[str]:
     """Return a line for each failed task, with its name and error, and the first traceback."""
+    # The last line of a traceback has the error.
     lines = [f"{name}: {text.splitlines()[-1]}" for name, text in failures.items()]
     tracebacks = [text for text in failures.values() if "\n" in text]
     return [*lines, *tracebacks[:1]]

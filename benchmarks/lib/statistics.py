@@ -59,7 +59,8 @@ def student(values: ArrayLike) -> Estimate:
         return Estimate(mean, mean, mean, runs)
     standard_error = float(sample.std(ddof=1)) / math.sqrt(runs)
     # The quantile of scipy.stats.t, which takes long to import.
-    half_width = float(scipy.special.stdtrit(runs - 1, INTERVAL_ENDS[1])) * standard_error
+    upper_end = INTERVAL_ENDS[1]  # 0.975
+    half_width = float(scipy.special.stdtrit(runs - 1, upper_end)) * standard_error
     return Estimate(mean, mean - half_width, mean + half_width, runs)
 
 

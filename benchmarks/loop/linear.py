@@ -358,6 +358,7 @@ def unfit(parameters: Parameters) -> str:
     samples = (test["time_constant"] + test["delay"]) / interval
     half_period = min(parameters.setpoint_period // 2, LONGEST_HOLD)
     if samples > half_period:
+        # With this interval, delay and time constant take `FITTING_PART` of half a period.
         fitting = float(f"{interval * samples / (FITTING_PART * half_period):.2g}")
         return (
             f"the plant is too slow for a set point that changes every {half_period} samples: "
@@ -454,7 +455,7 @@ class LinearLoop:
         if not characteristic.all():  # A pole lies on the circle.
             return math.inf
         half_turns = _turns(characteristic).sum() / math.pi
-        if round(half_turns) != 0:
+        if round(half_turns) != 0:  # the number of poles outside the unit circle
             return math.inf
         denominator = _values_on_circle(self.denominator, frequencies)
         return float(np.abs(denominator / characteristic).max())
@@ -543,6 +544,7 @@ def time_constant_for(
         )
     if len(robust) == len(tried):
         return fastest
+    # The last time constant that is robust enough, and the first that is not.
     slow, fast = robust[-1], tried[len(robust)]
     while slow / fast > 1.0 + PRECISION:
         middle = math.sqrt(slow * fast)

@@ -82,11 +82,12 @@ def _measure_steps(setpoint: Array, output: Array) -> _StepMeasures:
         previous_setpoint = setpoint[first]
         if change == 0.0:  # The first set point is 0.
             continue
+        # The output minus the set point, in the direction of the change.
         overshoot = max(overshoot, float(np.max(-errors / change)))
         outside = np.flatnonzero(np.abs(errors) > SETTLING_BAND * abs(change))
         if len(outside) == 0:
             continue
-        samples_outside = float(outside[-1] + 1)
+        samples_outside = float(outside[-1] + 1)  # up to the last error outside the band
         if samples_outside == stop - first:  # The output has not settled at the end.
             samples_outside = math.inf
         settling_time = max(settling_time, samples_outside)

@@ -94,8 +94,10 @@ def drawn_numbers(parameters: Parameters, runs: int, seed: int) -> PlantNumbers[
     seed
         Seed of the first run; run i has the seed `seed + i`.
     """
+    # The low end of a range is replaced by the drawn values below.
     numbers: dict[str, Any] = parameters.lowest.select(PLANT_NUMBERS)
     if parameters.ranges:
+        # The infos of a reset have the values that it draws; these plants make no step.
         _, info = make_plants(runs, 1, **asdict(parameters)).reset(seed=seed)
         for name in parameters.ranges:
             numbers[name] = info[name]
@@ -167,6 +169,7 @@ def simulate_together(
     plants = make_plants(len(agents) * runs, samples, **arguments)
     seeds = [*range(seed, seed + runs)] * len(agents)
     trajectory = _trajectory_of(plants, act, samples, seeds)
+    # The columns of each controller's runs.
     return [trajectory[:, i : i + runs] for i in range(0, len(seeds), runs)]
 
 

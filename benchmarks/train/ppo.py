@@ -74,6 +74,7 @@ def train(recipe: Recipe, seed: int) -> PolicyNetwork:
     model = begin(recipe, seed)
     curve = LearningCurve(recipe)
     model.learn(recipe.steps, callback=[Exploration(*recipe.log_std), curve])
+    # With the time of the learning curve, but not that of the validation.
     seconds = time.process_time() - began
     policy = export(model, recipe)
     validation = {}  # mean errors, degC
@@ -158,7 +159,7 @@ class TrainingBatch(VectorEnv[Any, Any, Any]):
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[NDArray[Any], Any]:
         """Reset all plants with a list of seeds, and return inputs, shape (plants, inputs)."""
-        seeds = np.split(np.array(seed), self._firsts)
+        seeds = np.split(np.array(seed), self._firsts)  # a part for each batch
         returned = [
             batch.reset(seed=part.tolist())
             for batch, part in zip(self.batches, seeds, strict=True)
@@ -233,6 +234,7 @@ class Exploration(BaseCallback):
         return True  # go on with the training
 
     def _on_rollout_start(self) -> None:
+        """Set the standard deviation for the samples up to the next update of the policy."""
         progress = self.num_timesteps / self.locals["total_timesteps"]
         log_std = cast("nn.Parameter", self.model.policy.log_std)
         log_std.data.fill_(self._first + progress * (self._last - self._first))
@@ -259,13 +261,16 @@ class LearningCurve(BaseCallback):
         return True  # go on with the training
 
     def _on_rollout_start(self) -> None:
+        """Score the policy if a score is due."""
         if self.num_timesteps >= len(self.points) * self._recipe.steps / SCORES:
             self._score()
 
     def _on_training_end(self) -> None:
+        """Score the policy that the training ends with."""
         self._score()
 
     def _score(self) -> None:
+        """Add the score of the present policy, as a network in NumPy, to `points`."""
         network = export(cast("PPO", self.model), self._recipe)
         result = score(network, {**network.interface, **self._recipe.scored_on})
         self.points.append({"samples": self.num_timesteps, **result})

@@ -139,7 +139,7 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
     recipe = replace(RECIPES["ppo"], plant=plant)
     scale = recipe.temperature_scale
     known = KnownPlant(plant)
-    calm, noisy = recipe.plants
+    calm, noisy = recipe.plants  # the two kinds of the recipe `ppo`
     training = {
         **plant,
         **_RANDOM,
@@ -147,7 +147,7 @@ def for_plant(plant: Mapping[str, Any]) -> Recipe:
         "setpoint_amplitude": _RANDOM["setpoint_amplitude"] * scale,
     }
     noise = {}
-    if known.parameters.range_of("noise_variance")[1] == 0.0:
+    if known.parameters.range_of("noise_variance")[1] == 0.0:  # the plant never has noise
         ratio = known.temperature_range / PAPER.temperature_range
         noise["noise_variance"] = _NOISE * ratio**2
     # A period of 500 samples for the paper's 600, and always an even number of samples.
@@ -186,7 +186,7 @@ def inputs(recipe: Recipe) -> Array:
         changes(len(flows), short_stretches=30) @ flows,
     ]
     if recipe.levels:
-        rows += [SETPOINT_SCALE * setpoints[:1], flows[:1]]
+        rows += [SETPOINT_SCALE * setpoints[:1], flows[:1]]  # the newest of each
     return np.vstack(rows)
 
 
