@@ -57,7 +57,7 @@ PACKAGE_FILE = ROOT / "mptc_gym" / "bounds.json"
 PACKAGED_EPISODES = EPISODES + 20
 PACKAGED = PRESETS | {
     f"{name}, random set points": {**PRESETS[name], "setpoint": "random"}
-    for name in ("paper", "disturbed", "fouling")  # the plants of the data sets
+    for name in ("paper", "disturbed", "fouling")  # for policies that meet random set points
 }
 
 
