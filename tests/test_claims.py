@@ -90,28 +90,36 @@ def test_settled_are_the_last_50_samples():
 class TestVerdicts:
     def test_a_claim_holds_where_all_its_criteria_are_met(self):
         ten = np.arange(10)
-        settles = np.array([ten < 9, ten < 9, ten < 8, ten < 9, np.full(10, np.nan)])
         quantities = {
-            "settled, dead zone 7": settles.astype(float),
-            "settled, plain": settles.astype(float),
-            "error, dead zone 7": np.array([[1.5], [1.4], [1.5], [np.nan], [np.nan]]),
-            "error, plain": np.ones((5, 1)),
+            "settled, plain": np.array([ten < 9, ten < 9, ten < 8, ten < 9]).astype(float),
+            "error, noise": np.array([[1.1], [1.2], [1.1], [np.nan]]),
+            "error, plain": np.ones((4, 1)),
         }
-        claims = {
-            "dead-zone": dataclasses.replace(CLAIMS["dead-zone"], setpoints=("constant",))
-        }
+        claims = {"noise": dataclasses.replace(CLAIMS["noise"], setpoints=("constant",))}
         judged = judge({"constant": quantities}, claims)
-        # 9 of 10 runs are most runs; 1.4 is not serious; a criterion that cannot be judged does
-        # not count, unless no criterion can be.
-        assert judged["dead-zone, constant"].tolist()[:4] == [1.0, 0.0, 0.0, 1.0]
-        assert np.isnan(judged["dead-zone, constant"][4])
-        assert judged["controls"].tolist()[:3] == [1.0, 1.0, 0.0]
+        # 9 of 10 runs are most runs; 1.2 is notable. Without one of its numbers, a claim cannot
+        # be judged.
+        assert judged["noise, constant"].tolist()[:3] == [1.0, 0.0, 0.0]
+        assert np.isnan(judged["noise, constant"][3])
+        assert judged["controls"].tolist() == [1.0, 1.0, 0.0, 1.0]
 
-    def test_a_set_point_inside_the_dead_zone_is_not_judged(self, short):
+    def test_a_result_of_the_paper_holds_if_all_of_its_claims_do(self):
+        works = {"dead-zone-works, square": [1.0, 1.0, np.nan]}
+        costs = {"dead-zone-serious, square": [1.0, 0.0, np.nan]}
+        holds = tables._results(pd.DataFrame(works | costs | {"pi, square": 1.0}), "square")
+        assert holds["dead zone"].tolist()[:2] == [1.0, 0.0]
+        assert holds.notna().sum(axis=1).tolist() == [2, 2, 1]
+
+    def test_a_set_point_that_the_flow_cannot_hold_is_not_judged(self, short):
         for level, can_be_judged in ((4.75, False), (5.0, True)):
             measured = conditions.constant(Batch(named(), level, runs=1, seed=0))
             assert np.isfinite(measured["error, dead zone 7"]).all() == can_be_judged
             assert np.isfinite(measured["error, plain"]).all()
+        for level, gain in ((4.25, "gain 1.25"), (5.5, "gain 0.8")):
+            measured = conditions.further_square(Batch(named(), level, runs=1, seed=0))
+            for plant in conditions.CHANGED_PLANTS:
+                is_judged = np.isfinite(measured[f"error, {plant}, learning"]).all()
+                assert is_judged == (plant != gain)
 
     def test_the_wrong_sign_diverges_and_the_right_one_settles(self):
         measured = conditions.responses(Batch(named(), 5.0, 3, 0), 600, {"setpoint": 5.0})

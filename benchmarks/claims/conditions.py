@@ -73,7 +73,8 @@ UPDATES = {
 def constant(batch: Batch) -> Measured:
     """Measure the conditions that the paper reports, at a constant set point."""
     setpoint = {"setpoint": batch.level}
-    return responses(batch, 600, setpoint) | lower_gains(batch, setpoint)
+    measured = responses(batch, 600, setpoint) | lower_gains(batch, setpoint)
+    return measured | {"converged": weights_converged(batch, 600, setpoint)}
 
 
 def square(batch: Batch) -> Measured:
@@ -99,7 +100,7 @@ def responses(batch: Batch, samples: int, setpoint: Arguments) -> Measured:
         controller = PIController(gains["kp"], gains["ki"])
         conditions[name] = controller, {}
         conditions[f"{name}, noise"] = controller, PLANTS["noise"]
-    measured = {"converged": weights_converged(batch, samples, setpoint)}
+    measured: Measured = {}
     for name, (agent, plant) in conditions.items():
         if not can_hold(batch.level, plant):
             nothing = np.full((len(batch.settings), batch.runs), np.nan)
@@ -120,10 +121,10 @@ def responses(batch: Batch, samples: int, setpoint: Arguments) -> Measured:
 
 
 def can_hold(level: float, plant: Arguments) -> bool:
-    """Return whether the flow that a set point needs lies outside a plant's dead zone."""
+    """Return whether the flow on a plant that a set point needs is one that can be applied."""
     parameters = Parameters(**plant)
-    gain = abs(float(linear.nominal(parameters).gain))
-    return level >= gain * parameters.lowest.dead_zone
+    flow = level / abs(float(linear.nominal(parameters).gain))
+    return parameters.lowest.dead_zone <= flow <= parameters.lowest.u_max
 
 
 def largest_deviation() -> float:
@@ -263,6 +264,8 @@ def further_square(batch: Batch) -> Measured:
             networks.weights = learnt_weights
             error = mean_error(batch.run(networks, RUN_LENGTH, **setpoint, **plant))
             error -= reference(RUN_LENGTH, **setpoint, **plant)
+            if not can_hold(batch.level, plant):
+                error = np.full(batch.loops, np.nan)
             measured[f"error, {name}, {updates}"] = batch.by_setting(error)
     return measured
 
