@@ -253,6 +253,7 @@ def _name_of(case: Parameters) -> str:
         of_preset = vars(case_of(Parameters(**arguments)))
         changes = [name for name in ARGUMENTS if getattr(case, name) != of_preset[name]]
         changes_of[IDS[preset]] = changes
+    # The preset from which the fewest arguments differ.
     name, changes = min(changes_of.items(), key=lambda item: len(item[1]))
     return f"{name} with another {', '.join(changes)}" if changes else name
 

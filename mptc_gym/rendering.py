@@ -168,7 +168,7 @@ def frame(record: Record) -> NDArray[np.uint8]:
 
 
 def show(record: Record, fps: float) -> None:
-    """Show a picture of a record in pygame's window, at most `fps` pictures a second.
+    """Show a picture of a record in pygame's window, at most `fps` pictures per second.
 
     `show` opens the window if none is open, and waits if the previous picture is too recent.
     """

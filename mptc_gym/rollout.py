@@ -227,6 +227,7 @@ class _FromVecEnv(VectorEnv[Any, Any, Any]):
 
 def _in_arrays(infos: Sequence[Infos]) -> dict[str, Any]:
     """Return the numbers in the infos of n plants, by name, in arrays of shape (n,)."""
+    # The infos of all plants have the same names.
     names = [name for name, value in infos[0].items() if isinstance(value, int | float)]
     return {name: np.array([info[name] for info in infos]) for name in names}
 

@@ -118,7 +118,7 @@ class _Noise(_Signal):
         new_xi.normal_(generator=self._generator).mul_(self._deviation)
         self._xi += new_xi.unbind()
         xi = torch.stack(self._xi)
-        noise = new_xi
+        noise = new_xi  # as the first coefficient of C is 1
         for lag, coefficient in enumerate(self._c[1:], start=1):
             first = len(self._c) - 1 - lag  # row of xi(k - lag), as row len(c) - 1 is xi(k)
             noise = noise.add(xi[first : first + samples], alpha=coefficient)

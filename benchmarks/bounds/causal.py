@@ -238,6 +238,7 @@ class SetPointLaw:
             # The probability that the level is held at this age, as in `_expected_slope`.
             count = self._longest - max(self._shortest, known_age + 1) + 1
             held_probability = min(1.0, (self._longest - age) / count)
+            # The slope that makes the sum 0, by its factor in the sum.
             solution = -known_sum / (self._impulse[0] * held_probability)
             slope[age] = np.clip(solution, -1.0, 1.0)
         return slope

@@ -133,7 +133,7 @@ def least_mean_distances(distribution: Distribution, slopes: Array) -> Array:
     # times value over all values up to this value.
     probability = weights.cumsum(axis=1)
     partial_mean = (weights * values).cumsum(axis=1)
-    mean = partial_mean[:, -1]
+    mean = partial_mean[:, -1]  # with all values
     samples, atoms = values.shape
     k = np.arange(samples)
     minima = np.empty((samples, len(slopes)))

@@ -71,6 +71,7 @@ class ErrorBounds:
         """
         ends = np.full(self.intercepts.shape, np.inf)
         corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
+        # A line that is nowhere the highest line gets the length 0.
         ends[:, :-1] = np.maximum.accumulate(corners, axis=1)
         return np.diff(ends, axis=1, prepend=0.0)
 

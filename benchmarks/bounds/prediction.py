@@ -45,9 +45,10 @@ def filtered_covariance(F: Array, Q: Array, reading_variance: float) -> Array:
         Covariances of the state x(k), given all readings up to k, shape (samples, size, size).
     """
     filtered = np.zeros_like(F)
-    P = filtered[0]
+    P = filtered[0]  # 0, as the state x(0) is known
     for k in range(1, len(F)):
         P = F[k] @ P @ F[k].T + Q[k]
+        # The reading is that of element 0.
         P = P - np.outer(P[:, 0], P[0]) / (P[0, 0] + reading_variance)
         filtered[k] = P
     return filtered

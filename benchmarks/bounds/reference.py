@@ -180,6 +180,7 @@ def _episodes_of(parameters: Parameters, samples: int, episodes: int, seed: int)
     return _Episodes(
         numbers=[plant_numbers(numbers, i) for i in range(episodes)],
         setpoints=trajectory.setpoint.T,
+        # Without e(0), as the mean of the reference error.
         idle_errors=mean_absolute_error((trajectory.setpoint - trajectory.output)[1:]),
     )
 

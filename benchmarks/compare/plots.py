@@ -60,6 +60,7 @@ def plot_scores(
     for agent in scores:
         agents_of[controllers[agent].group].append(agent)
     shown = {group: agents for group, agents in agents_of.items() if agents}
+    # The agents of a group are in the order of `scores`, the best one first.
     best = [f"{group} {scores[agents[0]].value:.3f}" for group, agents in shown.items()]
     title = f"Best score by prior knowledge: {', '.join(best)}"
     cases = estimates["scenario"].nunique()
@@ -154,7 +155,7 @@ def plot_responses(
             flow_axes.set_title(controllers[agent].prior_knowledge)
             _draw_temperature(temperature_axes, rows, colour)
             _draw_flow(flow_axes, rows, colour, scenario.parameters)
-        for axes in grid[-1]:
+        for axes in grid[-1]:  # the bottom row, whose time axis all rows share
             axes.set_xlabel("time (min)")
             axes.set_xlim(0.0, responses["time_s"].max() / 60.0)
         entries = _legend_of_responses(scenario.parameters)
@@ -209,6 +210,7 @@ def _draw_flow(axes: Axes, rows: pd.DataFrame, colour: str, plant: Parameters) -
     flows = rows["applied_run"].to_numpy()
     # Jumps, such as those across the dead zone, are thin, so that they do not hide the flow.
     axes.step(minutes, flows, where="post", color=colour, linewidth=0.4)
+    # Each flow holds until the next sample.
     axes.hlines(flows[:-1], minutes[:-1], minutes[1:], color=colour, linewidth=1.4)
     axes.set_ylabel("applied flow\n(t/h)")
 

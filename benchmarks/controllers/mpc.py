@@ -217,7 +217,7 @@ class PredictiveController:
 
         Column i of the result has the target of the output y(k + 1 + d + i), where k is the
         present sample and d the delay of the run's plant in samples. `setpoint` has the present
-        set points, degC, shape (runs,). `_targets` must be called once a sample, since the
+        set points, degC, shape (runs,). `_targets` must be called once per sample, as the
         method counts the samples since the latest change of the set point.
         """
         if self._random is None:
@@ -262,7 +262,7 @@ class PredictiveController:
         # The past flows that the coefficients of B multiply in the equation of y(k).
         # They are at 0 samples ahead, in the first row of each run.
         flows = np.take_along_axis(self._flows, self._flow_columns[:, 0], axis=1)
-        state[:, 0] += (flows * plants.beta).sum(axis=1)
+        state[:, 0] += (flows * plants.beta).sum(axis=1)  # to y(k)
         gain, self._covariance = self._gain_and_covariance(self._covariance, F, Q)
         self._state = state + gain * (reading - state[:, 0])[:, np.newaxis]
 
@@ -272,7 +272,7 @@ class PredictiveController:
         `before` is the covariance after the reading of the previous sample, and `_transition`
         describes F and Q. All matrices have the shape (runs, size, size), where size is the
         length of the state. The gain, of shape (runs, size), multiplies the difference between
-        a reading and the forecast of the reading.
+        a reading and the forecast of the reading, which is element 0 of the state, the output.
         """
         P = F @ before @ F.transpose(0, 2, 1) + Q
         variance = P[:, 0, 0] + self._numbers.measurement_noise_variance
@@ -311,7 +311,7 @@ class PredictiveController:
         flows *= np.stack([plants.beta for plants in models], axis=1)
         effects = flows.sum(axis=2)
         c = self._parameters.c
-        order = models[0].outputs_in_state
+        order = models[0].outputs_in_state  # the same for all models
         noise = self._state[:, order:LOAD_STEPS]  # xi(k), xi(k-1), ...
         load = self._state[:, LOAD_STEPS] + self._state[:, LOAD_WALK]
         outputs = [self._state[:, i] for i in reversed(range(order))]  # the newest last

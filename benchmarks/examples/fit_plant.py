@@ -94,6 +94,7 @@ def fit_lag(applied: Array, temperature: Array) -> tuple[int, float]:
     """Return delay in samples and pole p that give the smallest sum of squared errors."""
 
     def errors(log_time_constant: Array, delay: int) -> Array:
+        """Return the errors of a fit, degC; the first argument has one element."""
         pole = np.exp(-1.0 / np.exp(log_time_constant[0]))
         return regress(applied, temperature, delay, pole)[1]
 

@@ -45,6 +45,7 @@ def record(agent: Any, arguments: dict[str, Any], episodes: int) -> list[Episode
         return actions[-1]
 
     plants = gymnasium.make_vec("MiddlePoint-v0", episodes, **arguments)
+    # The sample k = 0 follows no step, and so has no reward.
     samples = [*rollout(plants, act, EPISODE_STEPS, range(SEED, SEED + episodes))]
     return [
         EpisodeBuffer(

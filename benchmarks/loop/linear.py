@@ -131,7 +131,7 @@ class LinearModel:
         for _ in range(DOUBLINGS):  # P is the sum of 2^i terms F^j g g' F'^j.
             P = P + power @ P @ power.T
             power = power @ power
-        return float(P[0, 0])
+        return float(P[0, 0])  # of the output, the first element of the state
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -201,6 +201,7 @@ class LinearModel:
         c = self.parameters.c
         order = self.outputs_in_state
         size = order + len(c) - 1
+        # Row 0 is equation (28); the other rows move outputs and noise on by a sample.
         F = np.zeros((*self.load_factor.shape, size, size)) + np.eye(size, k=-1)
         xi_row = slice(order, order + 1)  # the row of xi(k); no row if C = 1
         F[..., xi_row, :] = 0.0  # xi(k) does not depend on x(k-1)
@@ -243,6 +244,7 @@ class LinearModel:
         F[..., :LOAD_STEPS, :LOAD_STEPS] = F_noise
         F[..., LOAD_STEPS, LOAD_STEPS] = no_jump_probability
         F[..., LOAD_WALK, LOAD_WALK] = 1.0
+        # The load w(k) acts on y(k) at once, so row 0 has its parts in terms of x(k-1).
         F[..., 0, LOAD_STEPS] = self.load_factor * no_jump_probability
         F[..., 0, LOAD_WALK] = self.load_factor
         E = np.zeros((*self.load_factor.shape, size, 3))
@@ -308,7 +310,7 @@ def step_test(parameters: Parameters) -> dict[str, float]:
     samples = len(parameters.b) + 2 * math.ceil(settling_time) + 2
     # The response begins with the last sample before the output can react.
     response = np.append(0.0, plant.impulse_response(samples).cumsum())
-    response /= response[-1]
+    response /= response[-1]  # the final value, as the transient has died away
     late_time = _time_of(LATE_LEVEL, response)  # samples
     early_time = _time_of(EARLY_LEVEL, response)
     time_constant = 1.5 * (late_time - early_time)

@@ -178,6 +178,7 @@ def inputs(recipe: Recipe) -> Array:
     # Row i of the identity matrix selects element i of an observation.
     identity = np.eye(sum(lengths))
     identity[: -recipe.memory] /= recipe.temperature_scale  # all elements but the flows
+    # The rows of each window of the observation, the newest sample first.
     setpoints, error, temperatures, flows = np.split(identity, np.cumsum(lengths[:-1]))
     rows = [
         error,

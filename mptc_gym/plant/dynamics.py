@@ -61,7 +61,7 @@ class Dynamics:
 
     def __init__(self, parameters: Parameters) -> None:
         self._drift_samples = parameters.drift_samples
-        self._negated_a = [-coefficient for coefficient in parameters.a[1:]]
+        self._negated_a = [-coefficient for coefficient in parameters.a[1:]]  # from z^-1 on
         self._sum_of_a = sum(parameters.a)  # A(1)
         # The coefficients of Q, with A = Q times 1 - p z^-1, followed by a 0 that makes them as
         # long as A. The list is empty if the time constant never changes.

@@ -91,7 +91,7 @@ class RandomSignal(ABC):
 
     def ahead(self) -> list[float]:
         """Return the signal of a single plant at the samples of a block, degC, in a list."""
-        generators = [self._streams[0].generator]
+        generators = [self._streams[0].generator]  # of the only plant, with the index 0
         block = self._generate(ONLY_PLANT, generators, len(self._block))
         values: list[float] = block[0].tolist()  # the row of the only plant
         return values
@@ -177,7 +177,7 @@ class Noise(RandomSignal):
         for generator, new_xi in zip(generators, xi[:, order:], strict=True):
             generator.standard_normal(out=new_xi)
         self._past_xi[plants] = xi[:, samples:]  # the last `order` values
-        c = self._scaled_c[:, plants]
+        c = self._scaled_c[:, plants]  # times the values of xi, which have the variance 1
         noise: Values = c[0] * xi[:, order:]
         for lag, coefficient in enumerate(c[1:], start=1):
             noise += coefficient * xi[:, order - lag : -lag]  # `lag` samples earlier
