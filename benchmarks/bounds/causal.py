@@ -111,7 +111,7 @@ class SetPointLaw:
         # The output's response to a flow of 1 t/h at one sample, degC. Element 0 is the first
         # output that the flow can affect.
         zeros = model.lag - int(model.numbers.delay) - 1  # leading zeros of B
-        # `impulse_response` begins d + 1 samples after the flow, with as many zeros.
+        # `impulse_response` begins d + 1 samples after the flow, with the zeros of B.
         self._impulse = at_start.impulse_response(samples + zeros)[zeros:]
 
     def penalty(self, setpoint: Array) -> Array:
@@ -238,7 +238,7 @@ class SetPointLaw:
             # The probability that the level is held at this age, as in `_expected_slope`.
             count = self._longest - max(self._shortest, known_age + 1) + 1
             held_probability = min(1.0, (self._longest - age) / count)
-            # The slope that makes the sum 0, by its factor in the sum.
+            # With this slope, times its own factor, the sum is 0.
             solution = -known_sum / (self._impulse[0] * held_probability)
             slope[age] = np.clip(solution, -1.0, 1.0)
         return slope

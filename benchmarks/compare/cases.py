@@ -120,7 +120,7 @@ def responses_over_time(
     the set points are random, the runs have different set points, and the percentiles are the
     values of the first run.
     """
-    first = trajectories[0]  # that of the first member, whose first run has column 0
+    first = trajectories[0]  # of the first member; its first run is in column 0
     outputs = np.hstack([trajectory.output for trajectory in trajectories])
     if scenario.parameters.setpoint == "random":
         outputs = outputs[:, :1]

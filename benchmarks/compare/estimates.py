@@ -111,7 +111,7 @@ def write_table(path: Path, table: pd.DataFrame) -> None:
     """
     columns: dict[Any, Any] = {}
     for name, cells in table.items():
-        if isinstance(cells.iloc[0], Estimate):  # as all cells of the column
+        if isinstance(cells.iloc[0], Estimate):  # and so are all cells of the column
             for field, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
                 columns[f"{name}{suffix}"] = [getattr(cell, field) for cell in cells]
         else:

@@ -262,7 +262,7 @@ class PredictiveController:
         # The past flows that the coefficients of B multiply in the equation of y(k).
         # They are at 0 samples ahead, in the first row of each run.
         flows = np.take_along_axis(self._flows, self._flow_columns[:, 0], axis=1)
-        state[:, 0] += (flows * plants.beta).sum(axis=1)  # to y(k)
+        state[:, 0] += (flows * plants.beta).sum(axis=1)  # the output y(k)
         gain, self._covariance = self._gain_and_covariance(self._covariance, F, Q)
         self._state = state + gain * (reading - state[:, 0])[:, np.newaxis]
 
@@ -272,7 +272,8 @@ class PredictiveController:
         `before` is the covariance after the reading of the previous sample, and `_transition`
         describes F and Q. All matrices have the shape (runs, size, size), where size is the
         length of the state. The gain, of shape (runs, size), multiplies the difference between
-        a reading and the forecast of the reading, which is element 0 of the state, the output.
+        a reading and the forecast of the reading. Element 0 of the state is the output, of
+        which the transmitter gives a reading.
         """
         P = F @ before @ F.transpose(0, 2, 1) + Q
         variance = P[:, 0, 0] + self._numbers.measurement_noise_variance

@@ -115,7 +115,7 @@ def read(declared: type[Declared], program: str, words: Sequence[str]) -> Declar
         default_parameter=defaults,
         result_action="return_value",
     )
-    app.default(declared)
+    app.default(declared)  # which Cyclopts calls with the options, by their names
     try:
         chosen = app(list(words), exit_on_error=False, print_error=False)
     except CycloptsError as error:

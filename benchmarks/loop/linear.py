@@ -244,7 +244,7 @@ class LinearModel:
         F[..., :LOAD_STEPS, :LOAD_STEPS] = F_noise
         F[..., LOAD_STEPS, LOAD_STEPS] = no_jump_probability
         F[..., LOAD_WALK, LOAD_WALK] = 1.0
-        # The load w(k) acts on y(k) at once, so row 0 has its parts in terms of x(k-1).
+        # y(k) depends on the load w(k), whose expected parts follow from x(k-1).
         F[..., 0, LOAD_STEPS] = self.load_factor * no_jump_probability
         F[..., 0, LOAD_WALK] = self.load_factor
         E = np.zeros((*self.load_factor.shape, size, 3))

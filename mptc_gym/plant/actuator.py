@@ -213,7 +213,8 @@ class WantedFlows:
         """
         flows = self._flows + self._flow_per_action * actions.clip(-1.0, 1.0)
         self._flows = flows.clip(self._u_min, self._u_max)
-        # The formulas of u for v > 0 and for v < 0, of which a mask makes one or both 0.
+        # The formulas for v > 0 and v < 0 in the docstring of the class are added: masks make
+        # the terms of the other direction 0.
         is_above = self._flows > 0.0
         is_below = self._flows < 0.0
         edges = is_above * self._dead_zone - is_below * self._dead_zone
@@ -234,6 +235,8 @@ def _slope(limit: float, dead_zone: float) -> float:
 
 class WantedFlow(WantedFlows):
     """The wanted flow of one plant in Python floats, equal bit for bit to `WantedFlows`.
+
+    Each episode has a new object, so `reset` is not used.
 
     Parameters
     ----------

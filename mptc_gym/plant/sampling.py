@@ -172,7 +172,7 @@ def plant_numbers(numbers: PlantNumbers[Values], i: int) -> PlantNumbers[float]:
     value that all plants share.
     """
     numbers_of_plant: dict[str, float] = {}
-    for name, values in vars(numbers).items():  # the fields of the dataclass
+    for name, values in vars(numbers).items():
         value = values[i] if values.ndim else values
         numbers_of_plant[name] = value.item()
     return PlantNumbers(**numbers_of_plant)
