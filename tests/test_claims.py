@@ -10,7 +10,7 @@ from agents import DirectNNController
 from benchmarks.claims import conditions, life, tables
 from benchmarks.claims.__main__ import main
 from benchmarks.claims.claims import CLAIMS, judge
-from benchmarks.claims.conditions import PARTS, converged_at
+from benchmarks.claims.conditions import converged_at, measure
 from benchmarks.claims.settings import AS_REPORTED, LEVELS, RANGES, Batch, draw_settings, named
 from benchmarks.loop.measures import settled
 from benchmarks.loop.runs import make_plants, simulate
@@ -112,11 +112,13 @@ class TestVerdicts:
 
     def test_a_set_point_that_the_flow_cannot_hold_is_not_judged(self, short):
         for level, can_be_judged in ((4.75, False), (5.0, True)):
-            measured = conditions.constant(Batch(named(), level, runs=1, seed=0))
+            batch = Batch(named(), level, runs=1, seed=0)
+            measured = conditions.responses(batch, 60, {"setpoint": level})
             assert np.isfinite(measured["error, dead zone 7"]).all() == can_be_judged
             assert np.isfinite(measured["error, plain"]).all()
         for level, gain in ((4.25, "gain 1.25"), (5.5, "gain 0.8")):
-            measured = conditions.further_square(Batch(named(), level, runs=1, seed=0))
+            batch = Batch(named(), level, runs=1, seed=0)
+            measured = conditions.changed_plants(batch, {"setpoint_amplitude": level})
             for plant in conditions.CHANGED_PLANTS:
                 is_judged = np.isfinite(measured[f"error, {plant}, learning"]).all()
                 assert is_judged == (plant != gain)
@@ -129,10 +131,7 @@ class TestVerdicts:
 
     def test_short_runs_of_all_claims_give_the_numbers_that_they_gave(self, short):
         batch = Batch(named(), 5.25, runs=3, seed=500)
-        measured = {"constant": {}, "square": {}}
-        for part, measure in PARTS.items():
-            measured[part.split()[0]] |= measure(batch)
-        judged = judge(measured).T.rename_axis("number").set_axis([*"ab"], axis=1)
+        judged = judge(measure(batch)).T.rename_axis("number").set_axis([*"ab"], axis=1)
         golden = pd.read_csv(ROOT / "tests/golden/claims.csv", index_col=0)
         pd.testing.assert_frame_equal(judged, golden, rtol=1e-7, atol=1e-7)
 
@@ -190,9 +189,7 @@ class TestCommand:
     def test_without_all_that_was_measured_there_is_no_verdict(
         self, short, tmp_path, monkeypatch, capsys
     ):
-        for part in PARTS:
-            fails = part == "constant"
-            monkeypatch.setitem(PARTS, part, lambda batch, fails=fails: 1 / (1 - fails))
+        monkeypatch.setattr(conditions, "measure", lambda batch, is_complete=True: 1 / 0)
         out = tmp_path / "out"
         assert main([*self.WORDS, "--out", str(out)]) == 1
         assert "ZeroDivisionError" in capsys.readouterr().err

@@ -51,40 +51,29 @@ def work(options: Options) -> None:
     provenance = provenance_of(seeds={"first": SEED, "draws": options.draws})
     folder = new_folder(options.out, "claims", provenance)
     settings = draw_settings(options.draws, SEED)
-    drawn = {}
-    for level in sorted(set(settings["level"].tolist())):
-        of_level = settings[settings["level"] == level]
-        drawn[level] = Batch(of_level, level, RUNS, SEED + RUNS * int(of_level.index[0]))
-    chosen = {level: Batch(named(), level, LEVEL_RUNS, SEED) for level in NAMED_LEVELS}
-    chosen[PAPER_LEVEL] = Batch(named(), PAPER_LEVEL, options.runs, SEED)
-
+    paper_batch = Batch(named(), PAPER_LEVEL, options.runs, SEED)
     # The tasks that take longest start first.
     tasks: dict[str, Task] = {
-        f"life, {plant}": partial(life.operate, plant, options.days, SEED)
-        for plant in conditions.PLANTS
+        f"named, {PAPER_LEVEL:g}": partial(conditions.measure, paper_batch)
     }
-    for kind, batches in (("named", chosen), ("drawn", drawn)):
-        for level, batch in batches.items():
-            for part, measure in conditions.PARTS.items():
-                is_needed = kind == "drawn" or level == PAPER_LEVEL
-                if is_needed or part in conditions.REPORTED_PARTS:
-                    tasks[f"{kind}, {level:.2f}, {part}"] = partial(measure, batch)
+    for plant in conditions.PLANTS:
+        tasks[f"life, {plant}"] = partial(life.operate, plant, options.days, SEED)
+    levels = sorted(set(settings["level"].tolist()))
+    for level in levels:
+        of_level = settings[settings["level"] == level]
+        batch = Batch(of_level, level, RUNS, SEED + RUNS * int(of_level.index[0]))
+        tasks[f"drawn, {level:g}"] = partial(conditions.measure, batch)
+    for level in set(NAMED_LEVELS) - {PAPER_LEVEL}:
+        batch = Batch(named(), level, LEVEL_RUNS, SEED)
+        tasks[f"named, {level:g}"] = partial(conditions.measure, batch, is_complete=False)
     finished = options.fan_out.run(tasks, "claims")
     if finished.error:
         raise finished.error
 
-    def measured(kind: str, level: float) -> dict[str, conditions.Measured]:
-        """Return what was measured at a level, by the set point."""
-        of_setpoints: dict[str, conditions.Measured] = {"constant": {}, "square": {}}
-        for part in conditions.PARTS:
-            setpoint, *_ = part.split()
-            of_setpoints[setpoint] |= finished.results.get(f"{kind}, {level:.2f}, {part}", {})
-        return of_setpoints
-
-    verdicts = pd.concat([judge(measured("drawn", level)) for level in drawn])
+    verdicts = pd.concat([judge(finished.results[f"drawn, {level:g}"]) for level in levels])
     draws = settings.join(verdicts.set_axis(settings.index))
     operation = pd.concat([finished.results[f"life, {plant}"] for plant in conditions.PLANTS])
-    by_level = {level: measured("named", level) for level in chosen}
+    by_level = {level: finished.results[f"named, {level:g}"] for level in NAMED_LEVELS}
     report = sections(draws, by_level, life.summarise(operation))
     draws.to_csv(folder / "claims.csv", index_label="draw", float_format="%.4g")
     operation.to_csv(folder / "life.csv", index=False, float_format="%.4g")

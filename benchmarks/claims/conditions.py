@@ -6,7 +6,7 @@ mean of |e| minus the reference error of the same case.
 """
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -70,17 +70,20 @@ UPDATES = {
 }
 
 
-def constant(batch: Batch) -> Measured:
-    """Measure the conditions that the paper reports, at a constant set point."""
+def measure(batch: Batch, is_complete: bool = True) -> dict[str, Measured]:
+    """Measure the conditions of all claims, by the set point: "constant" or "square".
+
+    If not `is_complete`, only those of the results that the paper reports are measured.
+    """
     setpoint = {"setpoint": batch.level}
-    measured = responses(batch, 600, setpoint) | lower_gains(batch, setpoint)
-    return measured | {"converged": weights_converged(batch, 600, setpoint)}
-
-
-def square(batch: Batch) -> Measured:
-    """Measure the conditions that the paper reports, on a square wave."""
-    setpoint = {"setpoint_amplitude": batch.level}
-    return responses(batch, RUN_LENGTH, setpoint) | lower_gains(batch, setpoint)
+    constant = responses(batch, 600, setpoint) | lower_gains(batch, setpoint)
+    constant["converged"] = weights_converged(batch, 600, setpoint)
+    wave = {"setpoint_amplitude": batch.level}
+    square = responses(batch, RUN_LENGTH, wave) | lower_gains(batch, wave)
+    if is_complete:
+        constant |= failures(batch) | other_plants(batch)
+        square |= changed_plants(batch, wave) | day(batch, wave)
+    return {"constant": constant, "square": square}
 
 
 def responses(batch: Batch, samples: int, setpoint: Arguments) -> Measured:
@@ -212,8 +215,8 @@ def largest_pole(gains: Mapping[str, float]) -> float:
     return linear.LinearLoop.of(PIController(gains["kp"], gains["ki"]), plant).largest_pole()
 
 
-def further_constant(batch: Batch) -> Measured:
-    """Measure the failure of a node, and networks on other plants, at a constant set point."""
+def failures(batch: Batch) -> Measured:
+    """Measure networks in which a node fails, at a constant set point."""
     measured = {}
     for nodes, rates in ((3, ""), (6, ""), (6, ", same rates")):
         for stuck_at in (0, 1):
@@ -222,6 +225,12 @@ def further_constant(batch: Batch) -> Measured:
             after = batch.run(act, RUN_LENGTH, setpoint=batch.level)[FAILURE:]
             name = f"error, {nodes} nodes, one stuck at {stuck_at}{rates}"
             measured[name] = batch.by_setting(mean_error(after))
+    return measured
+
+
+def other_plants(batch: Batch) -> Measured:
+    """Measure networks on other plants, at constant set points in proportion to the gain."""
+    measured = {}
     for name, plant in OTHER_PLANTS.items():
         setpoint = batch.level * plant.get("gain_factor", 1.0)
         trajectory = batch.run(batch.networks(), RUN_LENGTH, setpoint=setpoint, **plant)
@@ -252,9 +261,8 @@ def with_failing_node(networks: DirectNNController, stuck_at: int) -> Act:
     return act
 
 
-def further_square(batch: Batch) -> Measured:
+def changed_plants(batch: Batch, setpoint: Arguments) -> Measured:
     """Measure networks that have learnt on the paper's plant, on plants that have changed."""
-    setpoint = {"setpoint_amplitude": batch.level}
     networks = batch.networks()
     batch.run(networks, RUN_LENGTH, **setpoint)
     learnt_weights = networks.weights
@@ -270,25 +278,20 @@ def further_square(batch: Batch) -> Measured:
     return measured
 
 
-def day(batch: Batch) -> Measured:
+def day(batch: Batch, setpoint: Arguments) -> Measured:
     """Measure a day of continuous operation of networks and of PI (searched)."""
     measured = {}
-    setpoint = {"setpoint_amplitude": batch.level}
+    searched_pi = PIController(SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
     for name, plant in PLANTS.items():
-        for controller in ("NN", "PI"):
+        # A reference error from rest differs, as its first change of the set point is smaller
+        # than all later ones.
+        first = reference(WINDOW, **setpoint, **plant)
+        later = 2 * reference(2 * WINDOW, **setpoint, **plant) - first
+        for controller, agent in (("NN", batch.networks()), ("PI", searched_pi)):
             case = f"{name}, {controller}"
-            agent: Any = PIController(SEARCHED_GAINS["kp"], SEARCHED_GAINS["ki"])
-            if controller == "NN":
-                agent = batch.networks()
-            if can_hold(batch.level, plant):
-                windows = errors_by_window(agent, batch, DAY, **setpoint, **plant)
-                # A reference error from rest differs, as its first change of the set point is
-                # smaller than all later ones.
-                first = reference(WINDOW, **setpoint, **plant)
-                later = 2 * reference(2 * WINDOW, **setpoint, **plant) - first
-            else:
-                windows = np.full((DAY // WINDOW, len(batch.settings), batch.runs), np.nan)
-                first = later = np.nan
+            windows = errors_by_window(agent, batch, DAY, **setpoint, **plant)
+            if not can_hold(batch.level, plant):
+                windows[:] = np.nan
             best = np.median(windows, axis=-1).argmin(axis=0)  # by setting
             measured[f"error, first, {case}"] = windows[0] - first
             measured[f"error, last, {case}"] = windows[-1] - later
@@ -310,15 +313,3 @@ def errors_by_window(agent: Any, batch: Batch, samples: int, **arguments: Any) -
     for k, sample in enumerate(itertools.islice(steps, 1, None)):  # without sample 0
         totals[k // WINDOW] += np.abs(sample.infos["error"])
     return batch.by_setting(totals / WINDOW)
-
-
-# Functions that measure parts of the conditions. The first word of a part is its set point.
-PARTS: dict[str, Callable[[Batch], Measured]] = {
-    "square day": day,
-    "square": square,
-    "square further": further_square,
-    "constant": constant,
-    "constant further": further_constant,
-}
-# The parts that have what the paper reports as results in Section 5.
-REPORTED_PARTS = "constant", "square"
