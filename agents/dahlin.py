@@ -96,6 +96,7 @@ class DahlinController(InternalModelController):
             Coefficients of z^0, z^-1, z^-2 and so on in the numerator and in the denominator of
             the transfer function, as arrays.
         """
+        # The equations in the docstring of the class, solved for u with y_d = 0 and u_a = u.
         share = self._approach * self._filter  # g f
         numerator = share * np.array([1.0, -self._pole])
         lag = np.array([1.0, self._approach - 1.0])  # 1 - (1 - g) z^-1

@@ -185,8 +185,8 @@ class PolicyNetwork(Controller):
         """Raise a ValueError if the network does not fit the plants of an environment.
 
         The arguments are described in `Controller.check_environment`. In addition to the checks
-        of `Controller`, the environment must have the observations and the `max_move` of the
-        network's training.
+        of `Controller`, the environment must have the observations and, if actions change the
+        flow, the `max_move` of the network's training.
         """
         super().check_environment(parameters, n)
         # Another `compensated_dead_zone` is allowed. If actions set the flow, `max_move` has no

@@ -131,6 +131,7 @@ class Panel:
         """
         points = list(map(self._point, range(self._first, self._record.k + 1), values))
         if is_staircase:  # Each value is drawn at its own sample and at the next one.
+            # The x of the next sample belongs to the y of this one.
             doubled = np.repeat(points, 2, axis=0)
             points = np.column_stack((doubled[1:, 0], doubled[:-1, 1])).tolist()
         if len(points) > 1:  # as pygame draws no line through one point

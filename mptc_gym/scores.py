@@ -58,7 +58,7 @@ def score_interval(
     The arguments are those of `scores`, each of shape (episodes,).
     """
     episodes = len(errors)
-    generator = np.random.default_rng(0)
+    generator = np.random.default_rng(0)  # always this seed, for equal intervals
     resampled = []
     for _ in range(RESAMPLES):
         drawn = generator.integers(episodes, size=episodes)  # with replacement

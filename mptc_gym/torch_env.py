@@ -379,10 +379,10 @@ class _Plants:
         # The first row is that of the longest delay and the last term of B.
         flows = torch.stack(self._flows[:rows_of_all_delays])
         if isinstance(self._numbers.delay, Tensor):
-            flows = flows.gather(0, self._delayed_rows[:rows])
+            flows = flows.gather(0, self._delayed_rows[:rows])  # after each plant's own delay
         response = self._zeros
         for lag, coefficient in enumerate(beta):
-            first = len(beta) - 1 - lag
+            first = len(beta) - 1 - lag  # a further term of B needs earlier flows
             response = torch.add(response, flows[first : first + samples], alpha=coefficient)
         return response
 
@@ -455,7 +455,7 @@ class _Step(NamedTuple):
     def detach(self) -> _Step:
         """Return the same step without the gradient graph of earlier actions."""
         infos = {name: values.detach() for name, values in self.infos.items()}
-        setpoint, error, output = self.observed
+        setpoint, error, output = self.observed  # no set point depends on an action
         observed = setpoint, error.detach(), output.detach()
         return self._replace(observed=observed, rewards=self.rewards.detach(), infos=infos)
 

@@ -165,7 +165,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         rewards = self._rewards(error, a)
         reading = self._readings(output)
         observed_error = error
-        if reading is not output:
+        if reading is not output:  # it is `output` itself without noise and saturation
             observed_error = setpoint - reading
         observations = self._window.add(setpoint, observed_error, reading, a)
         self._last_actions = a

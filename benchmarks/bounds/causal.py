@@ -195,8 +195,9 @@ class SetPointLaw:
         # intervals: one ends at A, the other at -A. The lengths of the intervals, degC, are:
         above = np.maximum(A - level - way_up * progress - self._noise_magnitudes, 0.0)
         below = np.maximum(A + level - way_down * progress - self._noise_magnitudes, 0.0)
+        # The slope is 1 in the upper and -1 in the lower interval. The mean is over the noise.
         mean: Array = (above - below).mean(axis=1) / (2.0 * A)
-        mean[self._arrival_age :] = 0.0
+        mean[self._arrival_age :] = 0.0  # as in `_slope_after_change`
         return mean
 
     def _sums_after_next_change(self, level: float) -> Array:

@@ -155,7 +155,7 @@ def fitting_the_gain(
 
     A `CommandError` is raised if no controller is left.
     """
-    allowed = None, KnownPlant(plant.arguments()).direction
+    allowed = None, KnownPlant(plant.arguments()).direction  # None fits both signs
     fitting = {name: spec for name, spec in controllers.items() if spec.direction in allowed}
     labels = [spec.label for name, spec in controllers.items() if name not in fitting]
     note = ""

@@ -258,8 +258,10 @@ class WantedFlow(WantedFlows):
         elif flow < 0.0:
             command = -self._dead_zone + self._slope_below * flow
         rounded = float(np.float32(action_from_command(command, self._u_min, self._u_max)))
+        # `command_from_action`, written out for speed.
         rounded_command = (rounded + 1.0) * self._half_range + self._u_min
-        # Rarely, rounding moves a command from the edge of the dead zone into the dead zone.
+        # Rarely, rounding moves a command from the edge of the dead zone into the dead zone,
+        # from which `float32_action` moves it out again.
         if abs(command) >= self._dead_zone > abs(rounded_command):
             return float(float32_action(command, self._u_min, self._u_max, self._dead_zone))
         return rounded

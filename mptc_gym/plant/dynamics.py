@@ -122,7 +122,7 @@ class Dynamics:
             temperature.
         """
         alpha: list[Any] = self._negated_a
-        if self._quotient:
+        if self._quotient:  # the time constant can change
             # The coefficients of -(1 - p z^-1) Q, with p = `pole`, from z^-1 on.
             pole = 1.0 - self._rate / time_constant
             alpha = [
@@ -229,7 +229,10 @@ class Plant:
         return command, applied, output
 
     def _update_dynamics(self) -> None:
-        """Update the plant's coefficients and drift factors to the present sample."""
+        """Update the plant's coefficients and drift factors to the present sample.
+
+        This sample is k = 0, or the latest multiple of `DRIFT_INTERVAL`.
+        """
         factors = self._dynamics.factors(self._numbers, self._k)
         if self._drifts:
             self.factors = dict(zip(FACTORS, factors, strict=True))
