@@ -19,7 +19,7 @@ from mptc_gym.plant.parameters import EPISODE_STEPS, Parameters
 from mptc_gym.presets import FOR_LEARNING, IDS, PRESETS
 from mptc_gym.vector_env import MiddlePointVectorEnv
 
-__version__ = "0.7.0"
+__version__ = "0.8.0"
 __all__ = [
     "FOR_LEARNING",
     "IDS",
