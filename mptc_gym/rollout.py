@@ -322,6 +322,7 @@ def replayed(
     _, expected = plants.reset(seed=[*seeds])
     for k, sample in enumerate(samples):
         if k > 0:
+            # Where the info is missing, `_compare_infos` raises the error.
             commands = sample.infos.get("command", np.zeros(len(seeds)))
             actions = action_from_command(commands, case.u_min, case.u_max)
             expected = plants.step(np.reshape(actions, (-1, 1)))[-1]  # the infos

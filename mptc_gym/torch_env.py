@@ -276,7 +276,7 @@ class _Plants:
         # The limits are never ranges, so `lowest` has the limits of every plant.
         self._limits = parameters.lowest.u_min, parameters.lowest.u_max
         self._half_range = (self._limits[1] - self._limits[0]) / 2.0
-        self._middle = zeros.new_tensor(sum(self._limits) / 2.0)
+        self._middle = zeros.new_tensor(sum(self._limits) / 2.0)  # t/h, by the action 0
         self._shortest_delay, self._longest_delay = map(int, parameters.range_of("delay"))
         self.most_samples = self._shortest_delay + 1
         # The applied flows that the polynomial B still needs, t/h, the oldest first. At the

@@ -330,7 +330,7 @@ def parameters_of(env: Any) -> Parameters:
         return env.unwrapped.parameters
     try:
         parameters = env.get_attr("parameters")[0]  # an element for each plant, all alike
-    except AttributeError:
+    except AttributeError:  # no such attribute, or no `get_attr`, as in PyTorch
         parameters = None
     if not isinstance(parameters, Parameters):
         reject("env", env, "of mptc_gym and in NumPy, such as an id or a spec of it")

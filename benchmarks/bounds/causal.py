@@ -125,7 +125,7 @@ class SetPointLaw:
         # Row k, column j: the conditional mean of g(k), given the set points up to j.
         expected = np.zeros((samples, samples))
         previous_level = 0.0  # before the episode
-        for start, end in held(setpoint):
+        for start, end in held(setpoint):  # the periods of a constant set point
             level = setpoint[start]
             change_sums = self._sums_after_next_change(level)
             slope_if_held = self._slope_after_change(previous_level, level)

@@ -84,7 +84,7 @@ def predicted_variance(filtered: Array, F: Array, Q: Array, lag: int) -> Array:
         sample = sample + 1
         from_start = np.maximum(sample, 0)
         advanced = F[from_start] @ P @ F[from_start].transpose(0, 2, 1) + Q[from_start]
-        has_begun = sample >= 1
+        has_begun = sample >= 1  # the step to k = 1 is the first, from the known x(0)
         P = np.where(has_begun[:, np.newaxis, np.newaxis], advanced, P)
     # Rounding errors can make a variance of 0 negative.
     return np.maximum(P[:, 0, 0], 0.0)
