@@ -121,7 +121,7 @@ def test_the_first_run_is_shown_in_whole_and_as_a_temperature(figures, tmp_path)
     pi, _, smith, flow = figures[0].axes
     assert smith.get_title(loc="left") == "Smith: mean error 1.000 °C"
     assert flow.get_title(loc="left") == "knows a step test of the plant"
-    colour = GROUPS["paper"].colour
+    colour = GROUPS["paper's PI gains"].colour
     (run,) = [line for line in pi.get_lines() if line.get_color() == colour]
     np.testing.assert_array_equal(run.get_ydata()[-2:], [3.0, 7.0])
     low, high = pi.get_ylim()

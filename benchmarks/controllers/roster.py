@@ -48,7 +48,7 @@ GROUPS = {
     "plant": Group("knows the plant exactly", "#000000", "*"),
     "step test": Group("knows a step test of the plant", "#0072B2", "s"),
     "simulator": Group("settings from a simulator", "#007A5A", "D"),
-    "paper": Group("two gains from the paper", "#9B2F8C", "X"),
+    "paper's PI gains": Group("two gains from the paper", "#9B2F8C", "X"),
     "own": Group("your own", "#C04A00", "o"),
     "nothing": Group("knows nothing", "#666666", "P"),
 }
@@ -281,7 +281,7 @@ _SPECS = (
     ControllerSpec(
         name="pi",
         label="PI (1992)",
-        group="paper",
+        group="paper's PI gains",
         make=pi,
         knows="gains of the paper, for its plant",
         searched="2 gains; the paper does not say how they were found",

@@ -38,7 +38,7 @@ def draw(canvas: pygame.Surface, row: int, title: str, first: int, signals: Traj
     panel = Panel(canvas, record, area, -8.0, 8.0, text_size=29)
     panel.curve(SETPOINT, record.latest("setpoint"), 6, is_staircase=True)
     panel.curve(TEMPERATURE, record.latest("output"), 3, is_staircase=False)
-    error = np.abs(signals.setpoint - signals.output).mean()
+    error = np.abs(signals.next_error[:-1]).mean()  # as scores have it, without e(0)
     panel.write(title, TEXT, bottomleft=(12, area.top - 38))
     panel.write(ACTS[first], TEXT, bottomleft=(area.left, area.top - 6))
     panel.write(f"mean error {error:.2f} °C", TEXT, bottomright=(area.right, area.top - 6))
@@ -55,7 +55,7 @@ def main() -> None:
     canvas.fill(WHITE)
     pictures = []
     for first in ACTS:
-        for last in range(first, first + SAMPLES + 1, STRIDE):
+        for last in range(first + STRIDE, first + SAMPLES + 1, STRIDE):
             for row, (title, signals) in enumerate(zip(CONTROLLERS, runs, strict=True)):
                 draw(canvas, row, title, first, signals[first : last + 1])
             pictures.append(Image.fromarray(pygame.surfarray.array3d(canvas).swapaxes(0, 1)))
