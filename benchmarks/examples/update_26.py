@@ -1,4 +1,4 @@
-"""Compare the paper's update (27) of the network with the update that equation (26) suggests.
+"""Compare the paper's update (27) of the network with one that equation (26) might suggest.
 
 Equation (26) multiplies the present error by the activations d + 1 = 19 samples before, from
 which the present temperature results: `python -m benchmarks.examples.update_26`.
