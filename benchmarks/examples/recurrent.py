@@ -1,5 +1,6 @@
 """Train a recurrent policy by gradients through the plants of `MiddlePointHard-v0`.
 
+    pip install -e ".[compare,torch]"
     python -m benchmarks.examples.recurrent             # three minutes, writes recurrent.pt
     python -m benchmarks.compare --presets --scenarios hard --agents mpc \
         --agent mine=benchmarks.examples.recurrent:make
@@ -7,7 +8,7 @@
 The plants of `MiddlePointHard-v0` (preset `hard`) differ between episodes. The policy observes
 only the set point and the error, so the network's gated recurrent unit (GRU) has to identify
 the plant from past samples. The network's output is a change of the flow, and past flows are
-among the network's inputs.
+among the network's inputs. Expect a mean error of about 1.43 degC on the validation episodes.
 """
 
 import sys
