@@ -132,8 +132,7 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         mask = self._checked_mask(options or {})
         if not self._was_reset and not mask.all():
             raise ResetNeeded("the first reset must include all environments")
-        # Checks and applies the seed, and any options of the subclass.
-        self._prepare(mask, seed, options or {})
+        self._prepare(mask, seed)  # checks and applies the seed
         infos = self._begin_episodes(mask, infos={})
         self._was_reset = True
         return self._window.present(), infos
@@ -260,11 +259,10 @@ class BatchEnv(HasJsonSpec, VectorEnv[Array, Array, Array], ABC):
         return mask.copy()
 
     @abstractmethod
-    def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
-        """Check the seed and the options of a `reset` of the plants in `mask`, and apply both.
+    def _prepare(self, mask: Mask, seed: Any) -> None:
+        """Check the seed of a `reset` of the plants in `mask`, and apply the seed.
 
-        A ValueError is raised if the seed or an option is invalid. The options contain any
-        `reset_mask`, from which `mask` comes.
+        A ValueError is raised if the seed is invalid.
         """
 
     @abstractmethod

@@ -14,7 +14,7 @@ import functools
 import inspect
 import math
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -766,10 +766,10 @@ class MiddlePointTorchEnv(BatchEnv):
         """Return a NumPy array as a new tensor, without waiting for the device."""
         return torch.from_numpy(values).to(self.device, copy=True, non_blocking=True)
 
-    def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
+    def _prepare(self, mask: Mask, seed: Any) -> None:
         """Restart the random number generator of all plants with the seed, if there is one.
 
-        A ValueError is raised if `seed` is invalid. There are no options.
+        A ValueError is raised if `seed` is invalid.
         """
         if seed is not None:
             self._generator.manual_seed(checks.seed("seed", seed))

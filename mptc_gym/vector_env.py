@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -108,6 +108,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._plants = PlantBatch(parameters, num_envs)
         self._wanted_flows: WantedFlows | None = None
         if parameters.action == "change":
+            # The wanted flows before k = 0 are zeros.
             self._wanted_flows = WantedFlows(parameters, np.zeros(num_envs))
         self._window = _Window(parameters.windows, num_envs)
         self._last_actions = np.zeros(num_envs)
@@ -117,7 +118,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         self._all_true = np.ones(num_envs, np.bool_)
         self._all_false = np.zeros(num_envs, np.bool_)
         self._error_scale = np.array(parameters.error_scale)
-        self._minus_half = np.array(-0.5)
+        self._minus_half = np.array(-0.5)  # factor of the quadratic reward
 
     __signature__: ClassVar[inspect.Signature] = full_signature(__init__)
 
@@ -151,6 +152,7 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
         # The speed of the environment depends on `_advance`. With few plants, the number of
         # NumPy calls in `_advance` determines the speed.
         if self._wanted_flows is not None:
+            # From here on, the actions are those that command the changed flows.
             a = self._wanted_flows.change(a)
         signals = self._signals
         setpoint = signals.setpoint.next()
@@ -269,10 +271,10 @@ class MiddlePointVectorEnv(BatchEnv, VectorEnv[Any, Any, Any]):  # skrl inspects
             final_observations[i] = observations[i].copy()
         return final_observations
 
-    def _prepare(self, mask: Mask, seed: Any, options: Mapping[str, Any]) -> None:
+    def _prepare(self, mask: Mask, seed: Any) -> None:
         """Restart the random number streams of the plants in `mask` that have a seed.
 
-        A ValueError is raised if `seed` is invalid. There are no options.
+        A ValueError is raised if `seed` is invalid.
         """
         seeds = self._checked_seeds(seed)
         for i in np.flatnonzero(mask).tolist():
