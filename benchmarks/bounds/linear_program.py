@@ -71,7 +71,9 @@ class ErrorBounds:
         """
         ends = np.full(self.intercepts.shape, np.inf)
         corners = -np.diff(self.intercepts, axis=1) / np.diff(self.slopes)
-        # A line that is nowhere the highest line gets the length 0.
+        # An intercept is a minimum of functions that are linear in the slope, or a mean of such
+        # minima. So intercepts are concave functions of the slope, and corners ascend except
+        # for rounding. A line that is nowhere the highest line gets the length 0.
         ends[:, :-1] = np.maximum.accumulate(corners, axis=1)
         return np.diff(ends, axis=1, prepend=0.0)
 
@@ -236,7 +238,8 @@ def _program(
     slopes = bounds.slopes
     if travel_price:
         # A line may have the slope 0 near an error of 0, but a plan with little travel needs a
-        # slope above 0 to end at the set point.
+        # slope above 0 to end at the set point: with the slope 0, an error that saves travel
+        # would cost nothing.
         slopes = np.maximum(slopes, SMALLEST_SLOPE)
     signs = scipy.sparse.hstack([eye, -eye] * len(slopes))
     # Rows of the n outputs, from `first` on, and columns of the n flows, from `count` on; the

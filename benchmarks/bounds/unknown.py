@@ -93,7 +93,8 @@ def error_bounds(model: LinearModel) -> ErrorBounds:
     """
     numbers = model.numbers
     # The steps of the load's walk are uniformly distributed between -largest_step and
-    # largest_step, degC.
+    # largest_step, degC, so their variance is largest_step^2 / 3. As a step happens once per
+    # LOAD_INTERVAL samples, its variance is also LOAD_INTERVAL times the variance per sample.
     largest_step = np.sqrt(3.0 * LOAD_INTERVAL * numbers.disturbance_walk_variance)
     amplitude = numbers.disturbance_amplitude
     variance = noise_variance(model)

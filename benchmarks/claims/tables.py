@@ -107,7 +107,11 @@ def sections(
 
 
 def _shares(draws: pd.DataFrame, verdicts: Verdicts) -> pd.DataFrame:
-    """Return a row for each claim: shares of settings, and verdicts in the named settings."""
+    """Return a row for each claim: shares of settings, and verdicts in the named settings.
+
+    `draws` has a row for each drawn setting, with the columns that `judge` returns: `controls`
+    is 1 if most runs settle at a constant set point without noise.
+    """
     groups = {"all": draws, "that control": draws[draws["controls"] == 1.0]}
     rows = []
     for name, claim in CLAIMS.items():
@@ -182,17 +186,21 @@ def _results(judged: pd.DataFrame, setpoint: str) -> pd.DataFrame:
 def _verdicts(measured: Mapping[str, Measured]) -> Verdicts:
     """Return the verdicts in the named settings, from what was measured in them.
 
-    A verdict is undecided if less than `DECIDED` of the resamples of the runs agree with it.
+    A verdict is undecided if less than `DECIDED` of the resamples of the runs agree with it, or
+    if the claim cannot be judged.
     """
     judged = [f"{name}, {sp}" for name, claim in CLAIMS.items() for sp in claim.setpoints]
     verdicts = judge(measured)[judged]
     generator = np.random.default_rng(0)
+    # Share of the resamples that agree with each verdict. NaN stays NaN, which is not at least
+    # `DECIDED`, so a claim that cannot be judged is undecided.
     agreement = 0.0 * verdicts
     for _ in range(RESAMPLES):
         resampled = {}
         for setpoint, quantities in measured.items():
             runs = next(iter(quantities.values())).shape[-1]
             which = generator.integers(runs, size=runs)
+            # Each array x has the shape (settings, runs).
             resampled[setpoint] = {name: x[:, which] for name, x in quantities.items()}
         agreement += (judge(resampled)[judged] == verdicts) / RESAMPLES
     words = verdicts.replace({1.0: "yes", 0.0: "no"}).where(agreement >= DECIDED, "undecided")

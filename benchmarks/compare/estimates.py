@@ -89,9 +89,10 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     """Return percentiles over runs of measures such as the mean error and the valve travel.
 
     The returned table has a row for each scenario, controller and measure, with the columns
-    `scenario`, `agent`, `metric` (the name of the measure), `runs` (the number of
-    runs of all members), `median`, `p10` and `p90`. The argument `runs` is a table with a row
-    for each run.
+    `scenario`, `agent`, `metric` (the name of the measure), `runs` (the number of runs of all
+    members), `median`, `p10` and `p90`. The argument `runs` is a table with a row for each run.
+    The members of a controller are its training runs, numbered in the column `policy` of
+    `runs`; a controller that is not trained has one member.
     """
     measures = runs.columns.drop(["scenario", "agent", "policy", "seed"])
     rows = []

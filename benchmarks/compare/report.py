@@ -115,9 +115,9 @@ def write(
 ) -> str:
     """Write the CSV files, pictures and report of a comparison, and return text for the screen.
 
-    A scenario without a reference error is written to the CSV files, but not to the report.
-    `scenarios`, `references` and `controllers` have the scenario, the reference error and the
-    record of each controller by name, `provenance` is the provenance of
+    A scenario without a reference error is written to the CSV files except `estimates.csv`, but
+    not to the report. `scenarios`, `references` and `controllers` have the scenario, the
+    reference error and the record of each controller by name, `provenance` is the provenance of
     the results, as `provenance_of` returns it, `note` is a sentence on controllers that are
     left out, or "", and `error` says which results are missing. The returned text has the
     ratios and scores, `note`, and the path of the files.
@@ -155,12 +155,14 @@ def write(
         errors = case_runs.groupby("agent")["mae"].mean()
         path = folder / f"{scenario.name}.png"
         plots.plot_responses(rows, errors, scenario, controllers, path)
+    # `estimates` has a row for each controller and each scenario that it has finished.
     finished_cases = estimates["agent"].value_counts()
     incomplete = [name for name in scores if finished_cases[name] < len(reported)]
     if incomplete:
         labels = ", ".join(controllers[name].label for name in incomplete)
         missing = f"Scores over fewer cases, as results are missing: {labels}."
         note = f"{note} {missing}".strip()
+    # `doubts` returns sentences on cases in which no controller settles or all are at a limit.
     note = " ".join(filter(None, [note, *doubts(comparison)]))
     page = sections(comparison, note)
     write_report(folder, "Comparison of controllers", page, provenance, error)

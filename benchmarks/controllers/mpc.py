@@ -240,6 +240,7 @@ class PredictiveController:
         """
         plants = self._model(0).plants
         P = np.zeros((self._num_envs, self._state_size, self._state_size))
+        # F and Q depend on k, as the load changes only at every LOAD_INTERVAL-th sample.
         for k in range(1, WARM_UP):
             _, P = self._gain_and_covariance(P, *self._transition(k, plants))
         variance = np.zeros(self._num_envs)

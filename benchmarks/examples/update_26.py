@@ -24,10 +24,12 @@ class DelayedUpdate(DirectNNController):
     def _control(self, rows: Any) -> Any:
         """Return the commands u(k), and update the weights by equation (26)."""
         if self._sample == 0:
+            # The present inputs and those of the 19 samples before. Element 0 has the oldest,
+            # which are those of sample 0 until sample 19.
             self._past: deque[Any] = deque(maxlen=20)
             self.error_index = self.n_inputs  # The present error follows the inputs.
         inputs = rows[:, : self.n_inputs]
-        error = rows[:, 3:4]
+        error = rows[:, 3:4]  # e(k), which follows three set points in an observation
         self._past.append(inputs)
         self.learning = False
         u = super()._control(np.hstack([inputs, error]))
@@ -45,7 +47,7 @@ def main() -> None:
             name: multiple * getattr(paper, name)
             for name in ("eta", "eta_1", "eta_theta", "eta_1_theta")
         }
-        errors = []
+        errors = []  # of the update (27), and of the update (26)
         for kind in (DirectNNController, DelayedUpdate):
             networks = kind(num_envs=RUNS, **rates)
             plants = make_plants(RUNS, EPISODE_STEPS)

@@ -58,7 +58,8 @@ class FanOut:
         """Run tasks, and return the results of all tasks that have finished.
 
         A task that raises an exception does not stop the others. After Ctrl-C, no further task
-        starts.
+        starts. With `--backend ray`, all results come after the last task has finished, so an
+        earlier Ctrl-C loses them.
 
         Parameters
         ----------
