@@ -19,7 +19,7 @@ from mptc_gym.plant.parameters import EPISODE_STEPS
 from mptc_gym.rollout import rollout, start
 
 NN_COLOUR = GROUPS["simulator"].colour  # as in the pictures of a comparison
-PI_COLOUR = GROUPS["paper"].colour
+PI_COLOUR = GROUPS["paper's PI gains"].colour
 # How the error of a controller is drawn: networks in shades of green, the slower the lighter.
 LOOKS: dict[str, Any] = {
     "NN, rates x 1": {"color": "#00402F"},
