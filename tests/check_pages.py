@@ -25,7 +25,7 @@ from tests.test_package import EXAMPLES, PAGES, TRAININGS, shortened
 
 SHORT = {  # words that shorten a command, by its module or file
     "bounds": "--preset paper --mpc 2 --jobs 1",
-    "claims": "--draws 1 --runs 2 --days 1 --jobs 1",
+    "claims": "--help",  # `tests/test_claims.py` runs it, which takes a minute
     "compare": "--runs 2 --jobs 1",
     "offline": "--episodes 2",
     "recurrent": "2 4",  # steps and plants of the training
