@@ -45,8 +45,8 @@ def write_files(folder: Path) -> None:
             folder.joinpath(name).write_text(content, encoding="utf-8")
     bump_test().to_csv(folder / "log.csv")
     for example, _ in EXAMPLES:
-        if 'folder="best"' in example:
-            run(["-c", shortened(example)], folder)  # writes best/best_model.zip
+        if 'folder="best-hard"' in example:
+            run(["-c", shortened(example)], folder)  # writes best-hard/best_model.zip
 
 
 def commands() -> dict[Path, list[str]]:

@@ -179,13 +179,13 @@ class TestOwnControllers:
             "action": "change", "max_move": 2.0, "error_window": 8, "action_window": 30
         }  # fmt: skip
         env = make_vec_env("MiddlePointNoisy-v0", 4, **interface)
-        (tmp_path / "best").mkdir()
+        (tmp_path / "best-hard").mkdir()
         if factory == "ppo_normalised":
             env = VecNormalize(env)
         model = PPO("MlpPolicy", env, n_steps=16, batch_size=64, seed=0, device="cpu").learn(1)
-        model.save(tmp_path / "best/best_model.zip")
+        model.save(tmp_path / "best-hard/best_model.zip")
         if factory == "ppo_normalised":
-            env.save(tmp_path / "best/vecnormalize.pkl")
+            env.save(tmp_path / "best-hard/vecnormalize.pkl")
         page = (ROOT / "benchmarks/examples/train_your_own.md").read_text(encoding="utf-8")
         (code,) = re.findall(r"```python\n([^`]*def ppo[^`]*)```", page)
         monkeypatch.chdir(tmp_path)
