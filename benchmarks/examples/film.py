@@ -33,7 +33,9 @@ def draw(canvas: pygame.Surface, row: int, title: str, first: int, signals: Traj
     record = Record(PAPER.parameters.lowest, 8.0, first=first, span=SAMPLES)
     for setpoint, output in zip(signals.setpoint[:, 0], signals.output[:, 0], strict=True):
         record.add({"setpoint": setpoint, "output": output})
-    area = pygame.Rect(76 if first == 0 else 548, 70 + 206 * row, 384, 104)
+    left = 76 if first == 0 else 548  # the acts stand side by side
+    area = pygame.Rect(left, 70 + 206 * row, 384, 104)
+    # Erase what an earlier picture has here, with the labels of the axes.
     canvas.fill(WHITE, (area.left - 70, area.top - 34, 466, 172))
     panel = Panel(canvas, record, area, -8.0, 8.0, text_size=29)
     panel.curve(SETPOINT, record.latest("setpoint"), 6, is_staircase=True)
